@@ -341,11 +341,7 @@ class ForwardSelection:
         )
 
     def _from(
-        self,
-        start: Fitted,
-        first: Round,
-        shown: Sequence[Round],
-        bent: Round | None = None,
+        self, start: Fitted, first: Round, shown: Sequence[Round], bent: Round | None = None
     ) -> Selected:
         fitted, this = start, first
         rounds, taken = [*shown, first], [*shown]
@@ -361,14 +357,15 @@ class ForwardSelection:
             for i in dropped:
                 del taken[i]
             fitted = with_earlier_motion(self._simulator, fitted, self._alive)
+            if len(fitted.state.effects) > 1:
+                # effects that were not fitted to the end leave something for another to explain
+                fitted = polished(self._simulator, fitted, self._lines, self._noise, self._alive)
             if len(taken) == self._most or self._beyond_noise(fitted) < smallest:
                 break
             this = self._round(fitted)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
-            fitted = polished(self._simulator, fitted, self._lines, self._noise, self._alive)
-            # an effect that was not fitted to the end leaves something for another one to explain;
-            # all but the last were tried beside that
+            # all but the last were tried beside it
             newest = len(fitted.state.effects) - 1
             fitted, dropped = without_needless(
                 self._simulator, fitted, self._worth, max(newest, len(shown)), last=0
