@@ -18,7 +18,13 @@ import itertools
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import HARM, HARM_OF_REFIT, OF_SHAPE, STANDARD_ERRORS
+from piezo_ident.diagnosis.criteria import (
+    HARM,
+    HARM_OF_REFIT,
+    OF_SHAPE,
+    STANDARD_ERRORS,
+    TYPICAL_LEFT,
+)
 from piezo_ident.diagnosis.rows import centred, Rows
 
 #: share of a column's own energy that is added to the diagonal: keeps collinear columns small
@@ -199,7 +205,8 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
 
     A drift, or steps of the converter, lower the error of a refit on blocks between those that
     were fitted; a kind of excitation that was left out as a whole shows whether H is better.  An
-    offset of each record is no merit of the refit.
+    offset of each record is no merit of the refit.  Nor is a gain where the error is large, most
+    often at fast motion, at the cost of most other motion: the next record may hold more of that.
 
     `given` is the residual of the model as given, shape (n,), and `transfer` the sum of squares of
     each block by the refit, whole kinds held out.
@@ -207,6 +214,10 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     squares = centred(given, rows.of_record) ** 2
     before = np.bincount(rows.block, squares, minlength=rows.group.size)
     if standard_errors(before - transfer) < STANDARD_ERRORS:
+        return False
+    moves = before > 0.0
+    ratios = np.maximum(transfer[moves] / before[moves], np.finfo(float).tiny)
+    if np.mean(np.log(ratios)) > 2.0 * np.log(TYPICAL_LEFT):
         return False
     change = np.bincount(rows.group, transfer - before, len(rows.labels))
     # without labels parts of a record stand for kinds

@@ -682,6 +682,15 @@ def test_a_refit_holds_where_it_helps_all_kinds_by_more_than_a_shift_or_one_bloc
     assert not refit_holds(rows, one_block, np.bincount(rows.block, residual(rows) ** 2))
 
 
+@pytest.mark.parametrize(('elsewhere', 'holds'), [(1.0, False), (0.8, True)])
+def test_a_refit_must_help_most_of_the_motion(rows, elsewhere, holds):
+    # a few blocks of fast motion hold most of the error
+    fast = np.arange(BLOCKS) % 10 == 3
+    e = np.where(fast[rows.block], 10.0, 1.0) * residual(rows)
+    ratio = np.where(fast, 0.25, elsewhere)
+    assert refit_holds(rows, e, ratio * np.bincount(rows.block, e**2)) == holds
+
+
 def test_a_refit_that_knows_where_loops_were_must_know_their_shape_too(rows):
     shape, places = residual(rows), 0.003 * np.sin(7.0 * rows.block)
     # most of the error goes, on kinds of motion left out as well
