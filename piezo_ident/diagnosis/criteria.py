@@ -45,9 +45,6 @@ WIDE_SPREAD = 1.0
 EARLIER_COST, EARLIER_LEAVES = 0.003, 0.5
 #: share of the model's voltage range that data must cover for a refitted H to hold in all of it
 COVERED = 0.95
-#: share of that range that it is enough to sweep behind an unknown start before data are judged:
-#: wider plays are few, and stand where the early part says
-SWEPT = 0.8
 #: share of the voltage range below which the command is at rest but for noise
 TREMBLES = 0.01
 

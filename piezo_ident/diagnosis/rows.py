@@ -17,12 +17,12 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import COVERED, SWEPT
+from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.spectra import highest_frequency
-from piezo_ident.model.initial_memory import fit_start, is_at_rest
+from piezo_ident.model.initial_memory import fit_start, is_at_rest, SWEPT
 from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel

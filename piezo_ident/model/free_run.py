@@ -19,14 +19,7 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
-from piezo_ident.model.initial_memory import (
-    crept,
-    EARLY,
-    early_part,
-    fit_start,
-    forgetting,
-    forgotten,
-)
+from piezo_ident.model.initial_memory import crept, EARLY, early_part, fit_start
 from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
@@ -226,12 +219,10 @@ def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
 
 def _late(model: StageModel, piece: Piece, start: Start) -> int:
     """Return the first sample of a bridged piece that an estimate of their start leaves free."""
-    end = early_part(model, piece) if start.creep.size else 0
-    if start.memory is None:
-        return end
     # a voltage that rests forgets nothing
-    moves = np.ptp(piece.v) > 0.0
-    return max(end, forgotten(piece.v, way=forgetting(model)) if moves else piece.n)
+    if start.memory is not None and np.ptp(piece.v) == 0.0:
+        return piece.n
+    return early_part(model, piece) if start.memory is not None or start.creep.size else 0
 
 
 def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:

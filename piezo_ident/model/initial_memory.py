@@ -37,6 +37,9 @@ from scipy.optimize import lsq_linear
 
 #: share of its range that the voltage must sweep until the start is forgotten
 SHARE = 0.98
+#: and of the range of a model that is enough: wider plays are few, and stand where the early part
+#: says
+SWEPT = 0.8
 #: share of a lag's start that may be left where it is forgotten
 LEFT = 0.05
 #: samples that are searched together
@@ -132,10 +135,12 @@ def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
 
 def early_part(model: StageModel, piece: Piece) -> int:
     """Return the number of samples from which what was before a piece is estimated."""
-    known = is_at_rest(model, piece)
-    # later, what was before the start is forgotten
-    end = 10 if known else max(forgotten(piece.v, way=forgetting(model)), 10)
-    if _creeps(model):
+    creeps, end = _creeps(model), 10
+    if not is_at_rest(model, piece):
+        # later, what was before the start is forgotten; wide plays and creep look alike
+        enough = np.inf if creeps else SWEPT * float(np.ptp(model.scaling.range))
+        end = max(forgotten(piece.v, way=forgetting(model), enough=enough), end)
+    if creeps:
         end = max(end, int(np.ceil(EARLY * piece.n)))
     return min(end, piece.n)
 

@@ -131,7 +131,8 @@ def test_a_gap_does_not_make_an_unknown_start_known():
     record = Record((piece.cut(0, 500), piece.cut(501, piece.n)))
     found = free_run(PAPER, record)
     assert found.estimated == (True, False)
-    assert found.errors_after_start.n == piece.n - forgotten(V)
+    # four fifths of the range of the model are enough
+    assert found.errors_after_start.n == piece.n - forgotten(V, enough=8.0)
     still = Record((replace(piece, v=np.full(piece.n, 5.0)),))
     assert free_run(PAPER, still).errors_after_start is None
 
