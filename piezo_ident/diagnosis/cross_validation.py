@@ -215,9 +215,9 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     before = np.bincount(rows.block, squares, minlength=rows.group.size)
     if standard_errors(before - transfer) < STANDARD_ERRORS:
         return False
-    moves = before > 0.0
-    ratios = np.maximum(transfer[moves] / before[moves], np.finfo(float).tiny)
-    if np.mean(np.log(ratios)) > 2.0 * np.log(TYPICAL_LEFT):
+    errs = before > 0.0
+    left = np.maximum(transfer[errs] / before[errs], np.finfo(np.float64).tiny)
+    if np.mean(np.log(left)) > 2.0 * np.log(TYPICAL_LEFT):
         return False
     change = np.bincount(rows.group, transfer - before, len(rows.labels))
     # without labels parts of a record stand for kinds
