@@ -112,7 +112,8 @@ HARM = 0.1
 #: the same of a refit of H to labelled records, each kind predicted from the others: of 107 such
 #: refits of simulated stages five of the seven that cost more failed on another record
 HARM_OF_REFIT = 0.055
-#: rms that a refit may leave of a typical block (the geometric mean), over that of the given model
+#: rms that a refit to records without labels may leave of a typical block (the geometric mean),
+#: over that of the given model
 TYPICAL_LEFT = 0.93
 #: a rival that leaves less than this times what the best leaves is not separated from it
 AHEAD = 1.6

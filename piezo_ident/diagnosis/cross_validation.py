@@ -205,8 +205,9 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
 
     A drift, or steps of the converter, lower the error of a refit on blocks between those that
     were fitted; a kind of excitation that was left out as a whole shows whether H is better.  An
-    offset of each record is no merit of the refit.  Nor is a gain where the error is large, most
-    often at fast motion, at the cost of most other motion: the next record may hold more of that.
+    offset of each record is no merit of the refit.  Nor is, without labels, a gain where the error
+    is large, most often at fast motion, at the cost of most other motion: the next record may hold
+    more of that.
 
     `given` is the residual of the model as given, shape (n,), and `transfer` the sum of squares of
     each block by the refit, whole kinds held out.
@@ -215,14 +216,14 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     before = np.bincount(rows.block, squares, minlength=rows.group.size)
     if standard_errors(before - transfer) < STANDARD_ERRORS:
         return False
-    errs = before > 0.0
-    left = np.maximum(transfer[errs] / before[errs], np.finfo(np.float64).tiny)
-    if np.mean(np.log(left)) > 2.0 * np.log(TYPICAL_LEFT):
-        return False
     change = np.bincount(rows.group, transfer - before, len(rows.labels))
     # without labels parts of a record stand for kinds
     harm = HARM_OF_REFIT if rows.kinds else HARM
-    return bool(change[change > 0.0].sum() <= -harm * change.sum())
+    if change[change > 0.0].sum() > -harm * change.sum():
+        return False
+    errs = before > 0.0
+    left = np.maximum(transfer[errs] / before[errs], np.finfo(np.float64).tiny)
+    return bool(rows.kinds) or float(np.mean(np.log(left))) <= 2.0 * np.log(TYPICAL_LEFT)
 
 
 def takes_shape(rows: Rows, given: Array, held_out: Array, noise: float) -> bool:

@@ -683,12 +683,16 @@ def test_a_refit_holds_where_it_helps_all_kinds_by_more_than_a_shift_or_one_bloc
 
 
 @pytest.mark.parametrize(('elsewhere', 'holds'), [(1.0, False), (0.8, True)])
-def test_a_refit_must_help_most_of_the_motion(rows, elsewhere, holds):
+def test_without_labels_a_refit_must_help_most_of_the_motion(rows, elsewhere, holds):
     # a few blocks of fast motion hold most of the error
+    parts = SimpleNamespace(**(vars(rows) | {'kinds': ()}))
     fast = np.arange(BLOCKS) % 10 == 3
     e = np.where(fast[rows.block], 10.0, 1.0) * residual(rows)
     ratio = np.where(fast, 0.25, elsewhere)
-    assert refit_holds(rows, e, ratio * np.bincount(rows.block, e**2)) == holds
+    left = ratio * np.bincount(rows.block, e**2)
+    assert refit_holds(parts, e, left) == holds
+    # labels tell which kinds it helps
+    assert refit_holds(rows, e, left)
 
 
 def test_a_refit_that_knows_where_loops_were_must_know_their_shape_too(rows):
