@@ -58,6 +58,7 @@ def lab():
 
 def given(g, text):
     """Publish a model, and wait until the node has it."""
+    g.wait(lambda: 'models' in g.status('feedforward'), 'the status')
     seen = int(g.status('feedforward')['models'])
     g.publish_text('model', text)
     g.wait(lambda: int(g.status('feedforward')['models']) > seen, 'the model')
