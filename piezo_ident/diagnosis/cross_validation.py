@@ -221,9 +221,11 @@ def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
     harm = HARM_OF_REFIT if rows.kinds else HARM
     if change[change > 0.0].sum() > -harm * change.sum():
         return False
+    if rows.kinds:
+        return True
     errs = before > 0.0
     left = np.maximum(transfer[errs] / before[errs], np.finfo(np.float64).tiny)
-    return bool(rows.kinds) or float(np.mean(np.log(left))) <= 2.0 * np.log(TYPICAL_LEFT)
+    return bool(np.mean(np.log(left)) <= 2.0 * np.log(TYPICAL_LEFT))
 
 
 def takes_shape(rows: Rows, given: Array, held_out: Array, noise: float) -> bool:

@@ -365,7 +365,7 @@ class ForwardSelection:
             this = self._round(fitted)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
-            # all but the last were tried beside it
+            # of the others the rounds have asked whether they are needed, of the last one not yet
             newest = len(fitted.state.effects) - 1
             fitted, dropped = without_needless(
                 self._simulator, fitted, self._worth, max(newest, len(shown)), last=0
