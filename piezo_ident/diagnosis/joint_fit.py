@@ -10,7 +10,7 @@ but for a factor near one (`retuning.retuned`): a change of them is a candidate 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,12 +173,12 @@ def fit_jointly(
     damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
-    pull = _with_decays(rows, state, p, pull_at and pull_at(state, p))
+    pull = _with_costs(rows, state, parameters, p, pull_at and pull_at(state, p))
     for done in range(iterations):
         before = _loss(e, pull)
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
-        step = FitStep(base, moving, e, _prior(rows, e, p, state), pull)
+        step = FitStep(base, moving, e, _prior(rows, e, p, state, parameters), pull)
         aside = moving[:, [_only_adds(state, number) for number in parameters]]
         better, scale = None, Scale(rows, base, state.coefficients, e, aside)
         for failed in range(ATTEMPTS):
@@ -194,7 +194,7 @@ def fit_jointly(
             except ModelError:
                 damping *= WORSE ** (failed + 1)
                 continue
-            new = _with_decays(rows, trial, p, pull_at and pull_at(trial, p))
+            new = _with_costs(rows, trial, parameters, p, pull_at and pull_at(trial, p))
             after = _loss(left, new)
             if np.isfinite(after) and after < before:
                 better = trial
@@ -214,7 +214,7 @@ def fit_jointly(
     lower, upper = _room(state, parameters, p)
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
-    prior = _prior(rows, e, p, state)
+    prior = _prior(rows, e, p, state, parameters)
     E = e[:, None]
     known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
     equations = with_columns(rows, known, base.columns, moving, E).only(free)
@@ -268,7 +268,9 @@ def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     return firm
 
 
-def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
+def _prior(
+    rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
+) -> Array:
     prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
@@ -277,6 +279,7 @@ def _prior(rows: Rows, e: Array, p: int, state: State) -> Array:
     spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
     prior[: spread.size] = float(e @ e) / count / spread**2
     prior[_places_of_decays(state)] = cost_of_decays(rows)
+    prior[p - len(parameters) :] = [rows.n * number.cost**2 for number in parameters]
     return prior
 
 
@@ -291,13 +294,19 @@ def cost_of_decays(rows: Rows) -> float:
     return rows.n * EARLIER_COST**2
 
 
-def _with_decays(rows: Rows, state: State, p: int, pull: Pull | None) -> Pull | None:
-    """Return a pull with that of decays towards zero; `_prior` holds their diagonal."""
-    if not state.fading:
+def _with_costs(
+    rows: Rows, state: State, parameters: Sequence[FreeParameter], p: int, pull: Pull | None
+) -> Pull | None:
+    """Return a pull with that of what has a cost towards zero; `_prior` holds their diagonal."""
+    size, cost = np.zeros(p), np.zeros(p)
+    decays = _places_of_decays(state)
+    size[decays], cost[decays] = state.earlier.ravel(), cost_of_decays(rows)
+    for j, number in enumerate(parameters, start=p - len(parameters)):
+        if number.cost > 0.0:
+            size[j], cost[j] = number.get(state), rows.n * number.cost**2
+    if not cost.any():
         return pull
-    size, b = state.earlier.ravel(), np.zeros(p)
-    b[_places_of_decays(state)] = -cost_of_decays(rows) * size
-    s = cost_of_decays(rows) * float(size @ size)
+    b, s = -cost * size, float(cost @ size**2)
     if pull is None:
         return Pull(np.zeros((p, p)), b, s)
     return Pull(pull.A, pull.b + b, pull.s + s)

@@ -32,6 +32,7 @@ class FreeParameter:
     step: float
     lower: float
     upper: float
+    cost: float = 0.0
 
     def get(self, state: State) -> float:
         """Return its value."""
@@ -106,6 +107,8 @@ def free_parameters(
                     number = number_of(added.values[0], p.name, index)
                     if np.isfinite(number) and not (is_log and number <= 0.0):
                         found.append(
-                            FreeParameter(i, k, p.name, index, is_log, step, p.lower, p.upper)
+                            FreeParameter(
+                                i, k, p.name, index, is_log, step, p.lower, p.upper, p.cost
+                            )
                         )
     return tuple(found)

@@ -58,6 +58,9 @@ class Parameter:
     first_stays : bool
         Of a list that follows time: whether its first number stays in one record while H is free,
         which can do the same.
+    cost : float
+        Of an amplitude: the rms error that a fit takes a value of 1 for.  It keeps numbers small
+        that make up for one another.
     """
 
     name: str
@@ -73,6 +76,7 @@ class Parameter:
     scale: Literal['linear', 'log', 'fixed'] = 'linear'
     tries: tuple[Any, ...] = ()
     first_stays: bool = False
+    cost: float = 0.0
 
     def __post_init__(self) -> None:
         if self.default is None and self.is_amplitude:
