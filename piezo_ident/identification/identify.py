@@ -65,6 +65,8 @@ import scipy
 ELSEWHERE = 2.0
 #: share by which a model may err more without a pair of G that H may stand for
 AS_WELL = 0.01
+#: largest orders that are tried then, too
+SMALLER = (8, 4)
 _UNLABELLED = (
     '{}: no segments are labelled {}; drive the stage with the program identification, or '
     'identify unlabelled data in one go'
@@ -200,9 +202,15 @@ def _labelled(
 
     best = fitted(*(steps.dynamics or second_step(runs, delay, settings, progress)), lean=False)
     if without_pairs(best.model.dynamics, rate).a.size < best.model.dynamics.a.size:
-        lean = fitted(*second_step(runs, delay, settings, progress, lean=True), lean=True)
-        # H may do as well what the pair does
-        best = lean if lean.left < (1.0 + AS_WELL) ** 2 * best.left else best
+        sizes = [n for n in SMALLER if n < settings.max_order and not settings.order]
+        found = [best]
+        for size in (settings.max_order, *sizes):
+            of_size = replace(settings, max_order=size)
+            lean = second_step(runs, delay, of_size, progress, lean=True)
+            found.append(fitted(*lean, lean=True))
+        # H may do as well what the pair does, and large orders fit what H misses of the noise
+        least = min(model.left for model in found)
+        best = [model for model in found if model.left < (1.0 + AS_WELL) ** 2 * least][-1]
     runs, fit, held, model = best.runs, best.fit, best.held, best.model
     dynamics, hysteresis = best.dynamics, best.hysteresis
     warnings = []
