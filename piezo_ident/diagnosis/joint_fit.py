@@ -173,12 +173,14 @@ def fit_jointly(
     damping, last = DAMPING, 0.0
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
-    pull = _with_costs(rows, state, parameters, p, pull_at and pull_at(state, p))
+    given = pull_at and pull_at(state, p)
     for done in range(iterations):
+        prior = _prior(rows, e, p, state, parameters)
+        pull = _with_known(state, parameters, prior, given)
         before = _loss(e, pull)
         least = max(TOLERANCE * before, enough * e.size)
         lower, upper = _room(state, parameters, p)
-        step = FitStep(base, moving, e, _prior(rows, e, p, state, parameters), pull)
+        step = FitStep(base, moving, e, prior, pull)
         aside = moving[:, [_only_adds(state, number) for number in parameters]]
         better, scale = None, Scale(rows, base, state.coefficients, e, aside)
         for failed in range(ATTEMPTS):
@@ -194,8 +196,8 @@ def fit_jointly(
             except ModelError:
                 damping *= WORSE ** (failed + 1)
                 continue
-            new = _with_costs(rows, trial, parameters, p, pull_at and pull_at(trial, p))
-            after = _loss(left, new)
+            new = pull_at and pull_at(trial, p)
+            after = _loss(left, _with_known(trial, parameters, prior, new))
             if np.isfinite(after) and after < before:
                 better = trial
                 break
@@ -204,7 +206,7 @@ def fit_jointly(
             break
         gain, more = before - after, iterations - 1 - done
         damping = max(damping * next_damping(gain / promised), LEAST_DAMPING)
-        state, e, pull = better, left, new
+        state, e, given = better, left, new
         moving = _derivatives(simulator, state, parameters, tick)
         # a first step tells little of those behind it
         hopeless = done > 0 and after - _to_come(gain, last, more) > goal * e.size
@@ -215,6 +217,7 @@ def fit_jointly(
     alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
     free = (lower < -1e-12) & (upper > 1e-12) & alive
     prior = _prior(rows, e, p, state, parameters)
+    pull = _with_known(state, parameters, prior, given)
     E = e[:, None]
     known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
     equations = with_columns(rows, known, base.columns, moving, E).only(free)
@@ -271,15 +274,15 @@ def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
 def _prior(
     rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
 ) -> Array:
-    prior = np.zeros(p)
     # neighbouring residuals are alike: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
     # curves and lags are nearly collinear: only large steps of theirs do anything
     plays = 0 if state.law is None else state.law.thresholds.size
-    spread = np.where(np.arange(state.coefficients.size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
-    prior[: spread.size] = float(e @ e) / count / spread**2
+    spread, size = np.full(p, np.inf), state.coefficients.size
+    spread[:size] = np.where(np.arange(size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
+    spread[p - len(parameters) :] = [number.spread for number in parameters]
+    prior: Array = float(e @ e) / count / spread**2
     prior[_places_of_decays(state)] = cost_of_decays(rows)
-    prior[p - len(parameters) :] = [rows.n * number.cost**2 for number in parameters]
     return prior
 
 
@@ -294,21 +297,19 @@ def cost_of_decays(rows: Rows) -> float:
     return rows.n * EARLIER_COST**2
 
 
-def _with_costs(
-    rows: Rows, state: State, parameters: Sequence[FreeParameter], p: int, pull: Pull | None
+def _with_known(
+    state: State, parameters: Sequence[FreeParameter], prior: Array, pull: Pull | None
 ) -> Pull | None:
-    """Return a pull with that of what has a cost towards zero; `_prior` holds their diagonal."""
-    size, cost = np.zeros(p), np.zeros(p)
-    decays = _places_of_decays(state)
-    size[decays], cost[decays] = state.earlier.ravel(), cost_of_decays(rows)
+    """Return a pull with that of what is known to be small towards zero; `prior` is its weight."""
+    p = prior.size
+    size = np.zeros(p)
+    size[_places_of_decays(state)] = state.earlier.ravel()
     for j, number in enumerate(parameters, start=p - len(parameters)):
-        if number.cost > 0.0:
-            size[j], cost[j] = number.get(state), rows.n * number.cost**2
-    if not cost.any():
-        return pull
-    b, s = -cost * size, float(cost @ size**2)
+        if np.isfinite(number.spread):
+            size[j] = number.get(state)
+    b, s = -prior * size, float(prior @ size**2)
     if pull is None:
-        return Pull(np.zeros((p, p)), b, s)
+        return Pull(np.zeros((p, p)), b, s) if size.any() else None
     return Pull(pull.A, pull.b + b, pull.s + s)
 
 

@@ -32,7 +32,7 @@ class FreeParameter:
     step: float
     lower: float
     upper: float
-    cost: float = 0.0
+    spread: float = float('inf')
 
     def get(self, state: State) -> float:
         """Return its value."""
@@ -108,7 +108,7 @@ def free_parameters(
                     if np.isfinite(number) and not (is_log and number <= 0.0):
                         found.append(
                             FreeParameter(
-                                i, k, p.name, index, is_log, step, p.lower, p.upper, p.cost
+                                i, k, p.name, index, is_log, step, p.lower, p.upper, p.spread
                             )
                         )
     return tuple(found)

@@ -21,9 +21,9 @@ from piezo_ident.operators.chain import Block
 AT_ONCE = 0.05
 #: share of what creeps on after a step that may come back
 BACK = 0.5
-#: what a share of 1 costs a fit: neighbouring elements hardly differ, and make up for one another
-#: in data of a few seconds, and nowhere else
-COST = 0.01
+#: rms size of a share, known before: neighbouring elements hardly differ, and make up for one
+#: another in data of a few seconds, and nowhere else
+SPREAD = 0.02
 
 
 @kernel
@@ -76,7 +76,7 @@ class Creep(Effect):
             1.0,
             vector=True,
             step=1e-3,
-            cost=COST,
+            spread=SPREAD,
         ),
         Parameter(
             'time_constant', 's', 'time constant tau_i', NAN, 1e-4, 1e6, vector=True, scale='fixed'

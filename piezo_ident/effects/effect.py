@@ -58,9 +58,9 @@ class Parameter:
     first_stays : bool
         Of a list that follows time: whether its first number stays in one record while H is free,
         which can do the same.
-    cost : float
-        Of an amplitude: the rms error that a fit takes a value of 1 for.  It keeps numbers small
-        that make up for one another.
+    spread : float
+        Of an amplitude: rms size that its numbers are known to have, as one more observation in a
+        fit.  It keeps those small that make up for one another.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Parameter:
     scale: Literal['linear', 'log', 'fixed'] = 'linear'
     tries: tuple[Any, ...] = ()
     first_stays: bool = False
-    cost: float = 0.0
+    spread: float = float('inf')
 
     def __post_init__(self) -> None:
         if self.default is None and self.is_amplitude:

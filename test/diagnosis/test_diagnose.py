@@ -457,8 +457,8 @@ def test_shares_of_creep_do_not_make_up_for_one_another():
     model, record, _ = measured('creep', 0.3, 1)
     (creep,) = diagnose(model, record, ONLY_CREEP).effects
     shares = np.asarray(creep.parameters['gain'].value)
-    # nine parts in ten of them, where each may be anything
-    assert np.abs(shares).sum() < 1.05 * shares.sum()
+    # nine times as much, where each may be anything
+    assert np.abs(shares).sum() < 1.5 * shares.sum()
 
 
 def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
