@@ -12,6 +12,7 @@ doi:10.1109/TMECH.2015.2465868.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import platform
 from typing import Any
@@ -206,11 +207,12 @@ def _labelled(
         found = [best]
         for size in (settings.max_order, *sizes):
             of_size = replace(settings, max_order=size)
-            lean = second_step(runs, delay, of_size, progress, lean=True)
-            found.append(fitted(*lean, lean=True))
+            # of so few orders none need be stable
+            with suppress(IdentificationError):
+                found.append(fitted(*second_step(runs, delay, of_size, progress, True), True))
         # H may do as well what the pair does, and large orders fit what H misses of the noise
-        least = min(model.left for model in found)
-        best = [model for model in found if model.left < (1.0 + AS_WELL) ** 2 * least][-1]
+        limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in found)
+        best = next((one for one in reversed(found) if one.left < limit), best)
     runs, fit, held, model = best.runs, best.fit, best.held, best.model
     dynamics, hysteresis = best.dynamics, best.hysteresis
     warnings = []
