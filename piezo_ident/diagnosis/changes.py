@@ -21,7 +21,7 @@ from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.diagnosis.row_filter import group_of, RowFilter, serves
 from piezo_ident.effects import Effect
 from piezo_ident.operators.chain import Block, Operator
-from piezo_ident.operators.dynamics import Dynamics, DynamicsOperator
+from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
 #: samples that pass all links while they are in the cache, about
@@ -73,8 +73,9 @@ class Behind:
         step = max(1, STRETCH // group) * group
         self._cuts = [slice(a, min(a + step, n)) for a in range(0, n, step)]
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
-        if not small:
-            kinds = ['bent' if kind == 'curved' else kind for kind in kinds]
+        # what scales the signal does so with changes of any size, and hardly varies within a row
+        alike = {'scaled': 'curved', 'curved': 'curved' if small else 'bent'}
+        kinds = [alike.get(kind, kind) for kind in kinds]
         if new:
             kinds[0] = 'bent'
         self._links = [
@@ -82,6 +83,11 @@ class Behind:
             for k, (operator, kind) in enumerate(zip(operators, kinds, strict=True))
             if kind != 'passed'
         ]
+
+    @property
+    def bends(self) -> bool:
+        """Whether a larger change is not just so many times a small one."""
+        return any(link.kind == 'bent' for link in self._links)
 
     def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
         """
@@ -156,23 +162,34 @@ class Behind:
         parts = [part for _, part in own if part is not None]
         if not serves(parts, self._m, self._n):
             return links, None, 1.0
-        others = [link for link, part in own if part is None]
+        others = [
+            link for link, part in own if part is None and not _takes_delay(parts, link.operator)
+        ]
         return [*links[:last], *others], RowFilter(parts, self._m), self._slopes(links[end:])
 
     def _slopes(self, links: Sequence[_Link]) -> Array | float:
         """Return the slope of links without memory in each row: it hardly changes within one."""
         product: Array | float = 1.0
         for k, operator, _ in links:
-            slope = _slope(operator, self._blocks[k].x[: self._n])
+            slope = self._slope(k, operator, slice(self._n))
             product = product * block_means(slope, self._m)
         return product
+
+    def _slope(
+        self, place: int, operator: Operator, cut: slice, signal: float | None = None
+    ) -> Array:
+        """Return the slope of a link in a stretch, of its signal or another one."""
+        whole, x = self._blocks[0], self._blocks[place].x[cut]
+        if signal is not None:
+            x = np.full(x.size, signal)
+        return cast(Effect, operator).slope(Block(t=whole.t[cut], v=whole.v[cut], x=x))
 
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
         """Bring links to rest, and return by how much that behind them changes with `rest`."""
         v0 = float(self._blocks[0].v[0])
         for k, operator, kind in links:
             if kind == 'curved':
-                rest *= float(_slope(operator, np.array([self._rests[k]]))[0])
+                rest *= float(self._slope(k, operator, slice(1), self._rests[k])[0])
             elif kind != 'bent':
                 rest = operator.reset(0.0, rest)
             else:
@@ -188,7 +205,7 @@ class Behind:
             block = block.with_signal(change)
         for k, operator, kind in links:
             if kind == 'curved':
-                block = block.with_signal(block.x * _slope(operator, self._blocks[k].x[cut]))
+                block = block.with_signal(block.x * self._slope(k, operator, cut))
                 continue
             if kind != 'bent':
                 block = operator.process(block)
@@ -198,10 +215,6 @@ class Behind:
             change = block.x - self._blocks[k + 1].x[cut]
             block = block.with_signal(change)
         return block.x
-
-
-def _slope(operator: Operator, x: Array) -> Array:
-    return cast(Effect, operator).slope(x)
 
 
 def _filter_of(operator: Operator) -> Dynamics | Array | None:
@@ -217,6 +230,21 @@ def _filter_of(operator: Operator) -> Dynamics | Array | None:
             if section is not None:
                 found.append(section * np.array([share, share, share, 1.0, 1.0]))
     return np.array(found) if found else None
+
+
+def _takes_delay(parts: list[Dynamics | Array], operator: Operator) -> bool:
+    """Put a delay into one of the filters, if it is one and one has the states for it."""
+    if not isinstance(operator, DelayOperator):
+        return False
+    whole, share = operator.delay.samples, operator.delay.fraction
+    late = np.array([*np.zeros(whole), 1.0 - share, share][: whole + 2 if share else whole + 1])
+    for i, G in enumerate(parts):
+        if isinstance(G, Dynamics) and G.sections is None:
+            b = np.convolve(G.b, late)
+            if b.size <= G.a.size + 1:
+                parts[i] = Dynamics(G.a, b)
+                return True
+    return False
 
 
 @kernel

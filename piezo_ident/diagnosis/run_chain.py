@@ -63,12 +63,14 @@ class RunChain:
         around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
         return around[0].slopes(blocks[core]) if around else {}
 
-    def behind_core(self, slope: Array, blocks: Sequence[Block], m: int) -> Array:
-        """Return the derivative of all rows from that of what comes out of H."""
+    def behind_core(self, slopes: Sequence[Array], blocks: Sequence[Block], m: int) -> list[Array]:
+        """Return the derivatives of all rows from those of what comes out of H."""
         self.blocks = list(blocks)
         behind = self.behind(place_of_core(self.operators) + 1, m)
-        small = SMALL / max(float(np.abs(slope).max(initial=0.0)), SMALL**2)
-        return behind.rows(small * slope) / small
+        if not behind.bends:
+            return [behind.rows(slope) for slope in slopes]
+        sizes = [max(float(np.abs(slope).max(initial=0.0)), SMALL) / SMALL for slope in slopes]
+        return [size * behind.rows(x / size) for x, size in zip(slopes, sizes, strict=True)]
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:
         """Return by how much all rows differ from a kept chain's, alike but for a link here."""
@@ -125,18 +127,13 @@ def columns_of(
     Of a chain whose blocks are kept, with H in the place `core`; `memory` and `places` as of
     `HysteresisLaw.columns`.
     """
-    before = chain.blocks[core]
-    around = effects_around(chain.operators[core])
-    around = [effect for effect in around if effect.of_hysteresis != 'not']
-    if not around:
+    before, rest = chain.blocks[core], chain.rests[core]
+    moving = moving_effects(chain.operators[core])
+    if not moving:
         yield from law.columns(before.x, memory, places)
         return
-    for part, own in law.parts(places):
-        operator: Operator = HysteresisOperator(part, memory[own])
-        for effect in reversed(around):
-            operator = type(effect)(effect.sample_rate, effect.values, part, operator)
-        operator.reset(float(before.v[0]), chain.rests[core])
-        yield operator.process(before).x
+    parts = ((part, memory[own]) for part, own in law.parts(places))
+    yield from moving[0].of_parts(before, rest, parts)
 
 
 def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
@@ -164,6 +161,11 @@ def effects_around(operator: Operator) -> list[Effect]:
         found.append(operator)
         operator = operator.inner
     return found
+
+
+def moving_effects(operator: Operator) -> list[Effect]:
+    """Return the effects around H whose part follows from its coefficients."""
+    return [effect for effect in effects_around(operator) if effect.of_hysteresis != 'not']
 
 
 def _core(operator: Operator) -> Operator:

@@ -34,7 +34,7 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.run_chain import (
     asked_once,
     columns_of,
-    effects_around,
+    moving_effects,
     place_of,
     place_of_core,
     RunChain,
@@ -160,9 +160,9 @@ class Simulator:
             core = place_of_core(chain.operators)
             behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
             memory = self.rows.memories[i](law.thresholds)
-            kinds = {effect.of_hysteresis for effect in effects_around(chain.operators[core])}
+            kinds = [effect.of_hysteresis for effect in moving_effects(chain.operators[core])]
             changes: Iterator[Array]
-            if kinds <= {'not', 'linear'}:
+            if kinds in ([], ['linear']):
                 changes = (step * raw for raw in columns_of(chain, core, law, memory, places))
             else:
                 moved = (
@@ -297,7 +297,7 @@ class Simulator:
 
         As of `filtered`; each wanted is an effect's place, or None, and the name of a parameter.
         """
-        kept, runs = self._known(), len(self._sources)
+        kept = self._known()
         columns: dict[int, Array] = {}
         for i in sorted({i for i, _ in wanted if i is not None}):
             effect = kept.state.effects[i].effect
@@ -305,19 +305,21 @@ class Simulator:
                 continue
             slopes = self._of_runs(partial(self._slopes, effect))
             known = [j for j, (own, name) in enumerate(wanted) if own == i and name in slopes[0]]
-            tasks = [(k, slopes[k][wanted[j][1]]) for j in known for k in range(runs)]
-            parts = list(self._pool.map(self._behind_core, tasks))
-            for at, j in enumerate(known):
-                columns[j] = self._joined(parts[at * runs : (at + 1) * runs])
+            names = [wanted[j][1] for j in known]
+            whole = self._of_columns(len(names), partial(self._behind_core, slopes, names))
+            columns |= dict(zip(known, whole, strict=True))
         return columns
 
     def _slopes(self, effect: type[Effect], i: int) -> Mapping[str, Array]:
         kept = self._known()
         return self._chain(kept.state, i).slopes(effect, kept.chains[i].blocks)
 
-    def _behind_core(self, task: tuple[int, Array]) -> Array:
-        (i, change), kept = task, self._known()
-        return self._chain(kept.state, i).behind_core(change, kept.chains[i].blocks, self.rows.m)
+    def _behind_core(
+        self, slopes: Sequence[Mapping[str, Array]], names: Sequence[str], i: int, places: range
+    ) -> Array:
+        kept, own = self._known(), [slopes[i][names[k]] for k in places]
+        chain = self._chain(kept.state, i)
+        return np.stack(chain.behind_core(own, kept.chains[i].blocks, self.rows.m))
 
     def _filtered(self, effect: type[Effect] | None, sections: Array, i: int) -> Array:
         chain = self._known().chains[i]

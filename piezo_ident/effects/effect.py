@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 import reprlib
@@ -149,11 +149,11 @@ class Effect:
     change : str
         What it makes of a small change of its signal: ``passed`` as it is, where the effect only
         adds something of its own; ``filtered``, the same whatever the signal and whenever;
-        ``linear``, the same whatever the signal; ``curved``, what the `slope` at its signal makes
-        of it; or ``bent``.
+        ``linear``, the same whatever the signal; ``scaled``, its `slope` times it; ``curved``,
+        the same as long as it is small; or ``bent``.
     of_hysteresis : str
         How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
-        ``not``, ``linear`` or ``bent``.
+        ``not``, ``linear`` (by `of_parts`) or ``bent``.
     in_delay_line : bool
         Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
@@ -183,7 +183,7 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
-    change: ClassVar[Literal['passed', 'filtered', 'linear', 'curved', 'bent']] = 'bent'
+    change: ClassVar[Literal['passed', 'filtered', 'linear', 'scaled', 'curved', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
 
@@ -331,9 +331,9 @@ class Effect:
         """
         return None
 
-    def slope(self, x: Array) -> Array:
-        """Return the slope of an effect that is ``curved`` at its signal, shape (n,)."""
-        return np.ones_like(x)
+    def slope(self, block: Block) -> Array:
+        """Return the slope of an effect that is ``scaled`` or ``curved``, shape (n,)."""
+        return np.ones_like(block.x)
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """
@@ -343,6 +343,17 @@ class Effect:
         parameters that are single numbers.  By default none: they are taken by differences.
         """
         return {}
+
+    def of_parts(
+        self, block: Block, rest: float, parts: Iterable[tuple[Hysteresis, Array]]
+    ) -> Iterator[Array]:
+        """
+        Give what H would become if it were one part of it alone, for each; shapes (n,).
+
+        For effects whose `of_hysteresis` is ``linear``.  Each part, plays alone or without any,
+        comes with the outputs of its plays before the block, and `rest` is the signal at rest.
+        """
+        raise NotImplementedError
 
     def number(self, name: str) -> float:
         """Return a scalar parameter."""

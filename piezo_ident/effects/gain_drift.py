@@ -51,7 +51,7 @@ class GainDrift(Effect):
 
     name = 'gain_drift'
     slot = 'output'
-    change = 'linear'
+    change = 'scaled'
     description = 'a gain that wanders during the record with temperature or age'
     needs = 'the same motion at the start and at the end of a long record'
     time_driven = True
@@ -110,11 +110,17 @@ class GainDrift(Effect):
 
     def process(self, block: Block) -> Block:
         """Return the block with the gain of each moment."""
-        time, gain = self.array('time'), self.array('gain')
-        if not gain.any():
+        if not self.array('gain').any():
             return block
-        x, t = (np.ascontiguousarray(signal) for signal in (block.x, block.t))
-        return block.with_signal(_with_gain(x, t, np.searchsorted(t, time), time, gain))
+        return block.with_signal(self._scaled(np.ascontiguousarray(block.x), block.t))
+
+    def slope(self, block: Block) -> Array:
+        """Return one and the gain of each moment."""
+        return self._scaled(np.ones(block.t.size), block.t)
+
+    def _scaled(self, x: Array, t: Array) -> Array:
+        time, gain = self.array('time'), self.array('gain')
+        return _with_gain(x, np.ascontiguousarray(t), np.searchsorted(t, time), time, gain)
 
     def c_code(self) -> CCode:
         """Return the effect in C."""

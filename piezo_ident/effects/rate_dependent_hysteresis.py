@@ -5,143 +5,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.kernel import alive, kernel, STILL
+from piezo_ident.common.kernel import STILL
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
+from piezo_ident.effects.moving_plays import (
+    growth_of_plays,
+    growth_slopes,
+    moved_plays,
+    speed_of,
+)
 from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
-from piezo_ident.operators.hysteresis import HysteresisOperator, LANES
-from piezo_ident.operators.kernels import curve, curve_slope, held
+from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator, LANES
 
 #: relative step of the low-pass of the speed, for the slope of the power
 NEAR = 1e-5
+#: what scales the growth, and what shapes it, as the loops and their results are ordered
+AMPLITUDES = ('gain', 'stretch', 'lead', 'lead_stretch')
+SHAPE = ('exponent', 'levelling', 'cutoff')
 #: speed below which the slope of its power is taken at it [spans/s]
 SLOW = 1e-3
-
-
-@kernel
-def _widened(
-    v: Array,
-    r: Array,
-    q: Array,
-    low_v: float,
-    c: Array,
-    power: Array,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
-    memory: Array,
-    still: Array,
-    out: Array,
-) -> None:
-    # memory: plays with growing thresholds; still: the same plays with fixed ones;
-    # low_v and c: as in `wide_hysteresis`; loops of few arrays each run in vector lanes
-    n_r = r.size
-    for k in range(v.size):
-        x = v[k]
-        more = gain * power[k]
-        wide = 1.0 + stretch * power[k]
-        ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
-        w = 0.0
-        for i in range(n_r):
-            still[i] = held(still[i], x - r[i], x)
-        for i in range(n_r):
-            width = r[i] * wide + more
-            low = x - (width if width > 0.0 else 0.0)
-            high = x + r[i] * ahead_wide + ahead
-            memory[i] = held(memory[i], low, low if high < low else high)
-        for i in range(n_r):
-            w += q[i] * (memory[i] - still[i])
-        if c.shape[0]:
-            for i in range(n_r):
-                f, g = memory[i] - low_v, still[i] - low_v
-                w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f) - curve(c, i, g)
-        out[k] = w
-
-
-@kernel
-def _slopes(
-    v: Array,
-    r: Array,
-    q: Array,
-    low_v: float,
-    c: Array,
-    power: Array,
-    bends: Array,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
-    memory: Array,
-    out: Array,
-) -> None:
-    # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
-    # bends, shape (j, n): slopes of the power; rows of out: gain, stretch, lead, lead_stretch, j
-    n_r, n_j = r.size, bends.shape[0]
-    by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
-    edge, moves, side = np.empty(n_r), np.empty(n_r), np.empty(n_r)
-    by_power = np.zeros((n_j, n_r))
-    for k in range(v.size):
-        x = v[k]
-        more = gain * power[k]
-        wide = 1.0 + stretch * power[k]
-        ahead, ahead_wide = lead * power[k], lead_stretch * power[k]
-        for i in range(n_r):
-            width = r[i] * wide + more
-            low = x - (width if width > 0.0 else 0.0)
-            high = x + r[i] * ahead_wide + ahead
-            f = memory[i]
-            # where the edges cross, the lower one counts
-            new = held(f, low, low if high < low else high)
-            moves[i] = 1.0 if new != f else 0.0
-            side[i] = -1.0 if new == low else 1.0
-            memory[i] = new
-        for i in range(n_r):
-            width = r[i] * wide + more
-            lower = -1.0 if width > 0.0 else 0.0
-            by_low[i] += moves[i] * ((0.5 - 0.5 * side[i]) * lower * power[k] - by_low[i])
-            by_high[i] += moves[i] * ((0.5 + 0.5 * side[i]) * power[k] - by_high[i])
-        for i in range(n_r):
-            width = r[i] * wide + more
-            lower = -gain - stretch * r[i] if width > 0.0 else 0.0
-            upper = lead + lead_stretch * r[i]
-            edge[i] = lower if side[i] < 0.0 else upper
-        for i in range(n_r):
-            weight[i] = q[i]
-        if c.shape[0]:
-            for i in range(n_r):
-                weight[i] += c[3, i] * (x - low_v) + curve_slope(c, i, memory[i] - low_v)
-        g, s, h, t = 0.0, 0.0, 0.0, 0.0
-        for i in range(n_r):
-            one, two = weight[i] * by_low[i], weight[i] * by_high[i]
-            g += one
-            s += one * r[i]
-            h += two
-            t += two * r[i]
-        out[0, k], out[1, k], out[2, k], out[3, k] = g, s, h, t
-        for j in range(n_j):
-            bend, total = bends[j, k], 0.0
-            for i in range(n_r):
-                new = by_power[j, i]
-                new += moves[i] * (edge[i] * bend - new)
-                by_power[j, i] = new
-                total += weight[i] * new
-            out[4 + j, k] = total
-
-
-@kernel
-def _low_pass(v: Array, pole: float, rate: float, state: Array) -> Array:
-    # state: the last input and the last speed
-    speed = np.empty(v.size)
-    last, s = state[0], state[1]
-    for k in range(v.size):
-        s = alive(pole * s + (1.0 - pole) * (v[k] - last) * rate)
-        last = v[k]
-        speed[k] = s
-    state[0], state[1] = last, s
-    return speed
 
 
 class RateDependentHysteresis(Effect):
@@ -193,7 +79,9 @@ class RateDependentHysteresis(Effect):
     )
 
     def prepare(self) -> None:
-        """Compute the pole of the low-pass of the speed."""
+        """Unpack the amplitudes, and compute the pole of the low-pass of the speed."""
+        gain, stretch, lead, lead_stretch = map(self.number, AMPLITUDES)
+        self._growth = gain, stretch, lead, lead_stretch
         self.pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
 
     @classmethod
@@ -238,17 +126,14 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = self.hysteresis.for_kernel
         power = self._power(v, self._speed)
         more = np.empty(v.size)
-        _widened(
+        growth_of_plays(
             v,
             r,
             q,
             low,
             c,
             power,
-            self.number('gain'),
-            self.number('stretch'),
-            self.number('lead'),
-            self.number('lead_stretch'),
+            *self._growth,
             self._memory,
             self._still,
             more,
@@ -261,13 +146,28 @@ class RateDependentHysteresis(Effect):
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
         power, bends = self._bent_power(v)
-        amplitudes = ('gain', 'stretch', 'lead', 'lead_stretch')
-        shape = ('exponent', 'levelling', 'cutoff')
-        out = np.empty((len(amplitudes) + len(bends), v.size))
-        gain, stretch, lead, lead_stretch = map(self.number, amplitudes)
-        memory = self._memory.copy()
-        _slopes(v, r, q, low, c, power, bends, gain, stretch, lead, lead_stretch, memory, out)
-        return dict(zip((*amplitudes, *shape), out, strict=True))
+        out = np.empty((len(AMPLITUDES) + len(SHAPE), v.size))
+        growth_slopes(v, r, q, low, c, power, bends, *self._growth, self._memory.copy(), out)
+        return dict(zip((*AMPLITUDES, *SHAPE), out, strict=True))
+
+    def of_parts(
+        self, block: Block, rest: float, parts: Iterable[tuple[Hysteresis, Array]]
+    ) -> Iterator[Array]:
+        """Give what each part of H becomes; see `Effect.of_parts`."""
+        v = np.ascontiguousarray(block.x)
+        power = self.power(v, rest)
+        for h, memory in parts:
+            if not h.thresholds.size:
+                still = HysteresisOperator(h, memory)
+                still.reset(float(block.v[0]), rest)
+                yield still.process(block).x
+                continue
+            r, q, *_, low, c = h.for_kernel
+            moved = np.zeros(r.size)
+            moved[: memory.size] = memory
+            out = np.empty(v.size)
+            moved_plays(v, r, q, low, c, power, *self._growth, moved, out)
+            yield out
 
     def c_code(self) -> CCode:
         """Return the effect in C."""
@@ -331,9 +231,7 @@ class RateDependentHysteresis(Effect):
 
     def power_and_slope(self, v: Array, v0: float) -> tuple[Array, Array]:
         """Return what `power` returns, and its slope with the speed s."""
-        speed = _low_pass(
-            np.ascontiguousarray(v), self.pole, self.sample_rate, np.array([v0, 0.0])
-        )
+        speed = speed_of(np.ascontiguousarray(v), self.pole, self.sample_rate, np.array([v0, 0.0]))
         exponent, levelled = (
             self.number('exponent'),
             1.0 + self.number('levelling') * np.abs(speed),
@@ -345,25 +243,26 @@ class RateDependentHysteresis(Effect):
 
     def _bent_power(self, v: Array) -> tuple[Array, Array]:
         """Return `_power`, and its slopes with exponent, levelling and cutoff, shape (3, n)."""
-        exponent, levelling, cutoff = map(self.number, ('exponent', 'levelling', 'cutoff'))
+        exponent, levelling, cutoff = map(self.number, SHAPE)
         near = float(np.exp(-2 * np.pi * cutoff * (1.0 + NEAR) / self.sample_rate))
         speed, other = (
-            np.abs(_low_pass(v, pole, self.sample_rate, self._speed.copy()))
+            np.abs(speed_of(v, pole, self.sample_rate, self._speed.copy()))
             for pole in (self.pole, near)
         )
         levelled = 1.0 + levelling * speed
         base = np.maximum(speed / levelled, STILL)
-        power = base**exponent
+        log = np.log(base)
+        power = np.exp(exponent * log)
         slope = exponent * power / (base * levelled**2)
         bends = [
-            power * np.log(base),
+            power * log,
             -exponent * power * base,
             slope * (other - speed) / (NEAR * cutoff),
         ]
         return power, np.stack(bends)
 
     def _power(self, v: Array, state: Array) -> Array:
-        power = np.abs(_low_pass(v, self.pole, self.sample_rate, state))
+        power = np.abs(speed_of(v, self.pole, self.sample_rate, state))
         if self.number('levelling') > 0.0:
             power /= 1.0 + self.number('levelling') * power
         if self.number('exponent') != 1.0:

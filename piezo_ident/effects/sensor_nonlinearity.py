@@ -55,9 +55,10 @@ class SensorNonlinearity(Effect):
         """Return the block as the sensor reads it."""
         return block.with_signal(self._read(block.x))
 
-    def slope(self, x: Array) -> Array:
+    def slope(self, block: Block) -> Array:
         """Return the slope of the curve."""
         c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))
+        x = block.x
         return 1.0 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4)))
 
     def c_code(self) -> CCode:

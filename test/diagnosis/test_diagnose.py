@@ -879,6 +879,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing():
     [
         ('creep', 'sensor_nonlinearity'),
         ('rate_dependent_hysteresis', 'gain_drift', 'backlash'),
+        ('rate_dependent_hysteresis', 'gain_drift', 'thermal_drift'),
         ('even_nonlinearity', 'amplifier_lag', 'changed_dynamics'),
         ('creep', 'changed_dynamics', 'thermal_drift'),
     ],

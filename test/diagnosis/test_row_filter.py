@@ -82,7 +82,9 @@ def test_a_record_may_be_shorter_than_a_group(samples):
     np.testing.assert_allclose(rows.process(x), block_means(whole, 4), rtol=0, atol=1e-14)
 
 
-def test_links_that_filter_may_stand_on_either_side_of_g():
+# a short delay goes with G, a longer one needs states of its own
+@pytest.mark.parametrize('delay', [Delay(1), Delay(0, 0.4), Delay(3, 0.4)])
+def test_links_that_filter_may_stand_on_either_side_of_g(delay):
     m, rate = 4, 20_000.0
     x = motion(120_011)
     block = Block(t=np.arange(x.size) / rate, v=x, x=x, channels={})
@@ -92,7 +94,7 @@ def test_links_that_filter_may_stand_on_either_side_of_g():
         creep(rate, values, None),
         DynamicsOperator(PAPER),
         DynamicsOperator(Dynamics([-0.4], [0.6])),
-        DelayOperator(Delay(3, 0.4)),
+        DelayOperator(delay),
     ]
     # a change that begins with a step, as one of H at rest does
     change = motion(x.size, 0.2)
@@ -102,6 +104,21 @@ def test_links_that_filter_may_stand_on_either_side_of_g():
         rest = link.reset(0.0, rest)
         passed = link.process(passed)
     np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
+    assert np.ptp(found) > 0.1
+
+
+def test_a_gain_that_follows_time_scales_changes_of_any_size():
+    m, rate = 6, 20_000.0
+    x = motion(120_000, 0.4)
+    block = Block(t=np.arange(x.size) / rate, v=x, x=x, channels={})
+    drift = find_effect('gain_drift')
+    values = drift.check({'time': [1.0, 4.0], 'gain': [0.1, -0.2]})
+    links = [DynamicsOperator(PAPER), drift(rate, values)]
+    change = motion(x.size, 0.2)
+    found = Behind(links, [0.0] * 3, [block] * 3, m).rows(change, 0.2)
+    links[0].reset(0.0, 0.2)
+    passed = links[1].process(links[0].process(block.with_signal(change)))
+    np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-4)
     assert np.ptp(found) > 0.1
 
 

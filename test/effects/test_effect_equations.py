@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.operators.play import play_columns
 import pytest
 
@@ -179,6 +180,22 @@ def test_rate_dependence_knows_its_derivatives(is_wide):
         difference = (up - down) / (2.0 * near)
         # a play that just leaves an edge, or just does not, is the rest
         assert np.quantile(np.abs(slopes[name] - difference), 0.98) < 1e-4 * np.ptp(difference)
+
+
+@pytest.mark.parametrize('name', ['plays', 'bias', 'duhem'])
+def test_rate_dependence_of_parts_of_h_adds_up(name):
+    law = HysteresisLaw(name, [0.1, 0.4])
+    theta = np.linspace(0.1, 0.3, law.size)
+    h, start, u = law.hysteresis(theta), np.array([0.02, -0.1]), 0.1 + signal(1500) / 20
+    effect = find_effect('rate_dependent_hysteresis')
+    values = effect.check({'gain': 1e-4, 'stretch': 2e-3, 'exponent': 0.8, 'cutoff': 500.0})
+    block = Block(np.arange(u.size) / FS, u, u)
+    operator = effect(FS, values, h, HysteresisOperator(h, start))
+    operator.reset(u[0], u[0])
+    parts = ((part, start[own]) for part, own in law.parts(range(law.size)))
+    found = np.array(list(operator.of_parts(block, u[0], parts)))
+    assert_allclose(theta @ found, operator.process(block).x, atol=1e-12)
+    assert np.abs(theta @ found - h(u, start)).max() > 1e-3
 
 
 # -- the static curve and the minor loops ------------------------------------------------------

@@ -1,0 +1,180 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The compiled loops of plays whose thresholds grow with the speed.
+
+Their equations are those of
+`piezo_ident.effects.rate_dependent_hysteresis.RateDependentHysteresis`.  The thresholds r and
+weights q, shapes (m,), come with idle plays that fill the vector lanes; `power` is ``|s|^eps``,
+shape (n,), of the speed s.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.kernel import alive, kernel, ordered_kernel
+from piezo_ident.operators.kernels import curve, curve_slope, held
+
+
+@ordered_kernel
+def _edges(
+    x: float,
+    r: float,
+    power: float,
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
+) -> tuple[float, float]:
+    """Return the edges of the band of a play; where they cross, the lower one counts."""
+    width = r * (1.0 + stretch * power) + gain * power
+    low = x - (width if width > 0.0 else 0.0)
+    high = x + r * (lead_stretch * power) + lead * power
+    return low, low if high < low else high
+
+
+@kernel
+def growth_of_plays(
+    v: Array,
+    r: Array,
+    q: Array,
+    low_v: float,
+    c: Array,
+    power: Array,
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
+    memory: Array,
+    still: Array,
+    out: Array,
+) -> None:
+    """
+    Write what growth adds to the sum of all plays into `out`, shape (n,), and carry both on.
+
+    `memory` is that of the plays whose thresholds grow, `still` of the same with fixed ones;
+    `low_v` and c are as in `piezo_ident.operators.kernels.wide_hysteresis`.
+    """
+    # loops of few arrays each run in vector lanes
+    n_r = r.size
+    for k in range(v.size):
+        x, p = v[k], power[k]
+        w = 0.0
+        for i in range(n_r):
+            still[i] = held(still[i], x - r[i], x)
+        for i in range(n_r):
+            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            memory[i] = held(memory[i], low, high)
+        for i in range(n_r):
+            w += q[i] * (memory[i] - still[i])
+        if c.shape[0]:
+            for i in range(n_r):
+                f, g = memory[i] - low_v, still[i] - low_v
+                w += c[3, i] * (x - low_v) * (f - g) + curve(c, i, f) - curve(c, i, g)
+        out[k] = w
+
+
+@kernel
+def moved_plays(
+    v: Array,
+    r: Array,
+    q: Array,
+    low_v: float,
+    c: Array,
+    power: Array,
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
+    memory: Array,
+    out: Array,
+) -> None:
+    """Write the sum of all plays whose thresholds grow into `out`; see `growth_of_plays`."""
+    for k in range(v.size):
+        x, p = v[k], power[k]
+        w = 0.0
+        for i in range(r.size):
+            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            memory[i] = held(memory[i], low, high)
+        for i in range(r.size):
+            w += q[i] * memory[i]
+        if c.shape[0]:
+            for i in range(r.size):
+                w += c[3, i] * (x - low_v) * (memory[i] - low_v) + curve(c, i, memory[i] - low_v)
+        out[k] = w
+
+
+@kernel
+def growth_slopes(
+    v: Array,
+    r: Array,
+    q: Array,
+    low_v: float,
+    c: Array,
+    power: Array,
+    bends: Array,
+    gain: float,
+    stretch: float,
+    lead: float,
+    lead_stretch: float,
+    memory: Array,
+    out: Array,
+) -> None:
+    """
+    Write the derivatives of what `moved_plays` does into `out`, shape (7, n).
+
+    By gain, stretch, lead and lead_stretch, and by three numbers that shape the power: `bends`,
+    shape (3, n), are the derivatives of the power by these.
+    """
+    # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
+    n_r = r.size
+    by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
+    one, two, three = np.zeros(n_r), np.zeros(n_r), np.zeros(n_r)
+    for k in range(v.size):
+        x, p = v[k], power[k]
+        bend_1, bend_2, bend_3 = bends[0, k], bends[1, k], bends[2, k]
+        for i in range(n_r):
+            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            f = memory[i]
+            new = held(f, low, high)
+            memory[i] = new
+            moves, is_low, is_wide = new != f, new == low, low < x
+            lower = -gain - stretch * r[i] if is_wide else 0.0
+            edge = lower if is_low else lead + lead_stretch * r[i]
+            by_low[i] = (-p if is_low and is_wide else 0.0) if moves else by_low[i]
+            by_high[i] = (0.0 if is_low else p) if moves else by_high[i]
+            one[i] = edge * bend_1 if moves else one[i]
+            two[i] = edge * bend_2 if moves else two[i]
+            three[i] = edge * bend_3 if moves else three[i]
+        for i in range(n_r):
+            weight[i] = q[i]
+        if c.shape[0]:
+            for i in range(n_r):
+                weight[i] += c[3, i] * (x - low_v) + curve_slope(c, i, memory[i] - low_v)
+        g, s, h, t, j_1, j_2, j_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(n_r):
+            w = weight[i]
+            g += w * by_low[i]
+            s += w * by_low[i] * r[i]
+            h += w * by_high[i]
+            t += w * by_high[i] * r[i]
+            j_1 += w * one[i]
+            j_2 += w * two[i]
+            j_3 += w * three[i]
+        out[0, k], out[1, k], out[2, k], out[3, k] = g, s, h, t
+        out[4, k], out[5, k], out[6, k] = j_1, j_2, j_3
+
+
+@kernel
+def speed_of(v: Array, pole: float, rate: float, state: Array) -> Array:
+    """Return the speed of v behind a low-pass; `state`, last input and speed, is carried on."""
+    speed = np.empty(v.size)
+    last, s = state[0], state[1]
+    for k in range(v.size):
+        s = alive(pole * s + (1.0 - pole) * (v[k] - last) * rate)
+        last = v[k]
+        speed[k] = s
+    state[0], state[1] = last, s
+    return speed
