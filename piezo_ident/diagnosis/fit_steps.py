@@ -11,6 +11,7 @@ doi:10.1137/0111030.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,11 +86,9 @@ class FitStep:
     def __init__(
         self, base: BaseColumns, moving: Array, e: Array, prior: Array, pull: Pull | None = None
     ) -> None:
-        # one pass over the many columns
-        known = base.columns.T @ np.concatenate([moving.T, e[None]]).T
-        mixed = known[:, :-1]
-        A = np.block([[base.total, mixed], [mixed.T, moving.T @ moving]])
-        b = np.concatenate([known[:, -1], moving.T @ e])
+        mixed, own = _products(base.columns, moving, e)
+        A = np.block([[base.total, mixed[:, :-1]], [mixed[:, :-1].T, own[:-1, :-1]]])
+        b = np.concatenate([mixed[:, -1], own[:-1, -1]])
         if pull is not None:
             A, b = A + pull.A, b + pull.b
         size = np.sqrt(np.diag(A))
@@ -124,6 +123,21 @@ class FitStep:
         """Return by how much a step lowers the sum of squares, were the model linear."""
         x = delta * self._size
         return float(x @ (2.0 * self._b - self._plain @ x))
+
+
+def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:
+    """Return the products of moving and e, side by side, with the columns and with themselves."""
+
+    def of(part: slice) -> tuple[Array, Array]:
+        # one pass over the many columns
+        own = np.concatenate([moving[part].T, e[None, part]]).T
+        return columns[part].T @ own, own.T @ own
+
+    # a library that is kept to one thread uses one processor
+    half = e.size // 2
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(of, (slice(half), slice(half, None)))
+    return first[0] + second[0], first[1] + second[1]
 
 
 def next_damping(kept: float) -> float:

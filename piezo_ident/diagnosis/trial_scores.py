@@ -11,6 +11,7 @@ blocks in addition to all that is in the model already.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,9 +88,8 @@ def score_trials(
     alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)
     view = _view_of(simulator, lines)
     trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
-    for done, (effect, trial) in enumerate(trials):
+    for done, (effect, trial, C) in enumerate(_with_columns(simulator, trials)):
         tick(done / len(trials))
-        C = _columns(simulator, effect, trial)
         if C is None or not np.all(np.isfinite(C)) or not np.any(C):
             continue
         both = with_columns(rows, equations, M, C, E)
@@ -117,25 +117,55 @@ def best_trials(
     return best
 
 
-def _columns(simulator: Simulator, effect: type[Effect], trial: Trial) -> Array | None:
-    """
-    Return what an effect would add to the rows for a step of each of its amplitudes.
+def _with_columns(
+    simulator: Simulator, trials: Sequence[tuple[type[Effect], Trial]]
+) -> Iterator[tuple[type[Effect], Trial, Array | None]]:
+    """Give each trial with its columns; those of the next one are made meanwhile."""
+    columns = _Columns(simulator)
+    with ThreadPoolExecutor(1) as thread:
+        coming = [thread.submit(columns.of, *trial) for trial in trials[:1]]
+        for k, (effect, trial) in enumerate(trials):
+            found = coming.pop().result()
+            coming += [thread.submit(columns.of, *after) for after in trials[k + 1 : k + 2]]
+            yield effect, trial, found
 
-    Shape (n, c): for an effect that is driven by time, a column for each record and amplitude.
-    None where it cannot run on these data.
-    """
-    rows = simulator.rows
-    count = len(rows.names)
-    columns = []
-    added = [Added(effect.name, (setting,) * count) for setting in trial.settings()]
-    for column in simulator.added(added):
-        if column is None:
-            return None
-        if effect.time_driven:
-            columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
-        else:
-            columns.append(column)
-    return np.array(columns).T
+
+class _Columns:
+    """Columns of trials; those of the effect at hand are kept, since its trials share some."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._effect: type[Effect] | None = None
+        self._kept: dict[tuple[bytes, ...], Array | None] = {}
+
+    def of(self, effect: type[Effect], trial: Trial) -> Array | None:
+        """
+        Return what an effect would add to the rows for a step of each of its amplitudes.
+
+        Shape (n, c): for an effect that is driven by time, a column for each record and amplitude.
+        None where it cannot run on these data.
+        """
+        rows = self._simulator.rows
+        count = len(rows.names)
+        if effect is not self._effect:
+            self._effect, self._kept = effect, {}
+        settings = {
+            tuple(np.asarray(value).tobytes() for value in setting.values()): setting
+            for setting in trial.settings()
+        }
+        new = [key for key in settings if key not in self._kept]
+        added = [Added(effect.name, (settings[key],) * count) for key in new]
+        self._kept |= dict(zip(new, self._simulator.added(added), strict=True))
+        columns = []
+        for key in settings:
+            column = self._kept[key]
+            if column is None:
+                return None
+            if effect.time_driven:
+                columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
+            else:
+                columns.append(column)
+        return np.array(columns).T
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
