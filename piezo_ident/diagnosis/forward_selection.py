@@ -336,9 +336,9 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        return search_round(
-            self._simulator, fitted, candidates, self._lines, self._noise, self._rng, tick
-        )
+        first = all(added.name in TESTED for added in fitted.state.effects)
+        fixed = self._lines, self._noise, self._rng
+        return search_round(self._simulator, fitted, candidates, *fixed, tick, first=first)
 
     def _from(
         self, start: Fitted, first: Round, shown: Sequence[Round], bent: Round | None = None

@@ -76,12 +76,14 @@ def search_round(
     noise: float,
     rng: np.random.Generator,
     tick: Tick,
+    *,
+    first: bool,
 ) -> Round:
     """
     Score all candidates and fit the best of them jointly.
 
     `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
-    `rng` draws the shifts of the surrogates.
+    `rng` draws the shifts of the surrogates.  A `first` effect may promise little at its trial.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * criteria.SURROGATES)
@@ -104,7 +106,8 @@ def search_round(
         scores.sort(key=lambda s: s.error)
     best = {name: scores[0] for name, scores in trials.items()}
     total = float(before.errors.sum())
-    least = criteria.WORTH_FIT * max(total - noise * n, 1e-300)
+    least = criteria.WORTH_FIT if first else criteria.LEAST_GAIN
+    least *= max(total - noise * n, 1e-300)
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
     chosen = promising[: criteria.JOINT_FITS]
@@ -146,18 +149,23 @@ def _add_plain_starts(
     """
     Add the best start of each effect beside a sum of plays, as an H of the wide law.
 
-    A wide H that has made up for an effect hardly lets go of it.
+    A wide H that has made up for an effect hardly lets go of it.  A start that leaves far more
+    than there was before is none, but of an effect that is either on or off.
     """
     law = before.state.law
     if not starts or law is None or law.name == 'plays':
         return
     plays = HysteresisLaw('plays', law.thresholds, law.span)
-    plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays))
+    # it need be no better than a start
+    enough = criteria.WORTH_FIT * before.mean_square
+    plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), enough=enough)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
     best = best_trials(simulator, plain, [effect for effect, _ in starts], lines)
+    most = criteria.AHEAD * float(before.errors.sum())
     for effect, states in starts:
-        if effect.name in best:
-            states.append(state.with_effect(started(simulator.rows, best[effect.name])))
+        one = best.get(effect.name)
+        if one is not None and (one.error < most or not one.trial.moves):
+            states.append(state.with_effect(started(simulator.rows, one)))
 
 
 def _contenders(
@@ -171,6 +179,8 @@ def _contenders(
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
     at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
+    # what gains less is no effect
+    worth = least - criteria.LEAST_GAIN * max(least - noise, 0.0)
 
     def alive() -> None:
         tick(at)
@@ -180,7 +190,7 @@ def _contenders(
         alive()
         # what will not gain a share of the best is hardly one of those fitted to the end, and
         # nothing else is a rival of one that leaves nothing
-        goal = before.mean_square - criteria.WORTH_END * (before.mean_square - least)
+        goal = min(worth, before.mean_square - criteria.WORTH_END * (before.mean_square - least))
         if least < done:
             goal = min(goal, criteria.FORM_RATIO * least + done)
         found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
@@ -203,7 +213,7 @@ def _contenders(
         if is_shown and gains[0] > 0.0 and gains[i] < criteria.WORTH_END * gains[0]:
             break
         # one that stays further behind the first is no rival of it
-        goal = criteria.FORM_RATIO * contenders[0].mean_square + done if is_shown else np.inf
+        goal = criteria.FORM_RATIO * contenders[0].mean_square + done if is_shown else worth
         try:
             fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]

@@ -86,7 +86,9 @@ def toward_given(
             law=given.law,
             coefficients=given.coefficients,
         )
-        beside = fit_jointly(simulator, known, base_at(simulator, known), tick=tick)
+        # one that would leave more stays behind
+        goal = fitted.mean_square / (1.0 - criteria.BENT_H)
+        beside = fit_jointly(simulator, known, base_at(simulator, known), goal=goal, tick=tick)
         if fitted.errors.sum() > (1.0 - criteria.BENT_H) * beside.errors.sum():
             known = replace(beside.state, retuning=())
             plain = fit_jointly(simulator, known, beside.base, tick=tick)
