@@ -37,6 +37,11 @@ class _Link(NamedTuple):
     operator: Operator
     kind: str
 
+    @property
+    def has_slope(self) -> bool:
+        """Whether a factor of each moment tells what becomes of a change."""
+        return self.kind in ('curved', 'scaled')
+
 
 class Behind:
     """
@@ -73,9 +78,8 @@ class Behind:
         step = max(1, STRETCH // group) * group
         self._cuts = [slice(a, min(a + step, n)) for a in range(0, n, step)]
         kinds = [getattr(operator, 'change', 'bent') for operator in operators]
-        # what scales the signal does so with changes of any size, and hardly varies within a row
-        alike = {'scaled': 'curved', 'curved': 'curved' if small else 'bent'}
-        kinds = [alike.get(kind, kind) for kind in kinds]
+        if not small:
+            kinds = ['bent' if kind == 'curved' else kind for kind in kinds]
         if new:
             kinds[0] = 'bent'
         self._links = [
@@ -122,7 +126,7 @@ class Behind:
         at = first.index(False) if False in first else len(first)
         before, tail = self._links[:at], self._links[at:]
         slopes: Array | float = 1.0
-        if all(link.kind == 'curved' for link in tail):
+        if all(link.has_slope for link in tail):
             tail, slopes = [], self._slopes(tail)
         rest = self._reset(before, rest)
         b0, b1, b2, a1, a2 = c
@@ -150,10 +154,11 @@ class Behind:
         """
         Links that make samples, a filter that makes rows, and what those are multiplied by.
 
-        The last links that filter trade places: G, and creep, make rows behind the others.
+        The last links that filter trade places: G, creep and a short delay make rows behind the
+        others.
         """
         links, end = self._links, len(self._links)
-        while end > 0 and links[end - 1].kind == 'curved':
+        while end > 0 and links[end - 1].has_slope:
             end -= 1
         last = end
         while last > 0 and links[last - 1].kind == 'filtered':
@@ -162,9 +167,10 @@ class Behind:
         parts = [part for _, part in own if part is not None]
         if not serves(parts, self._m, self._n):
             return links, None, 1.0
-        others = [
-            link for link, part in own if part is None and not _takes_delay(parts, link.operator)
-        ]
+        others = []
+        for link, part in own:
+            if part is None and not _takes_delay(parts, link.operator):
+                others.append(link)
         return [*links[:last], *others], RowFilter(parts, self._m), self._slopes(links[end:])
 
     def _slopes(self, links: Sequence[_Link]) -> Array | float:
@@ -179,10 +185,16 @@ class Behind:
         self, place: int, operator: Operator, cut: slice, signal: float | None = None
     ) -> Array:
         """Return the slope of a link in a stretch, of its signal or another one."""
-        whole, x = self._blocks[0], self._blocks[place].x[cut]
+        x = self._blocks[place].x[cut]
         if signal is not None:
             x = np.full(x.size, signal)
-        return cast(Effect, operator).slope(Block(t=whole.t[cut], v=whole.v[cut], x=x))
+        return cast(Effect, operator).slope(self._cut(cut).with_signal(x))
+
+    def _cut(self, cut: slice) -> Block:
+        """Return a stretch of the whole run."""
+        whole = self._blocks[0]
+        channels = {name: x[cut] for name, x in whole.channels.items()}
+        return Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
 
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
         """Bring links to rest, and return by how much that behind them changes with `rest`."""
@@ -198,13 +210,12 @@ class Behind:
 
     def _passed(self, links: Sequence[_Link], cut: slice, change: Array | None) -> Array:
         """Return what a change becomes in a stretch; stretches come one after the other."""
-        whole = self._blocks[0]
-        channels = {name: x[cut] for name, x in whole.channels.items()}
-        block = Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
+        block = self._cut(cut)
         if change is not None:
             block = block.with_signal(change)
-        for k, operator, kind in links:
-            if kind == 'curved':
+        for link in links:
+            k, operator, kind = link
+            if link.has_slope:
                 block = block.with_signal(block.x * self._slope(k, operator, cut))
                 continue
             if kind != 'bent':
@@ -236,14 +247,14 @@ def _takes_delay(parts: list[Dynamics | Array], operator: Operator) -> bool:
     """Put a delay into one of the filters, if it is one and one has the states for it."""
     if not isinstance(operator, DelayOperator):
         return False
-    whole, share = operator.delay.samples, operator.delay.fraction
-    late = np.array([*np.zeros(whole), 1.0 - share, share][: whole + 2 if share else whole + 1])
+    share = operator.delay.fraction
+    late = [1.0 - share, share] if share else [1.0]
+    more = operator.delay.samples + len(late) - 1
     for i, G in enumerate(parts):
-        if isinstance(G, Dynamics) and G.sections is None:
-            b = np.convolve(G.b, late)
-            if b.size <= G.a.size + 1:
-                parts[i] = Dynamics(G.a, b)
-                return True
+        if isinstance(G, Dynamics) and G.sections is None and G.b.size + more <= G.a.size + 1:
+            b = np.convolve(G.b, [*np.zeros(operator.delay.samples), *late])
+            parts[i] = Dynamics(G.a, b)
+            return True
     return False
 
 

@@ -130,7 +130,7 @@ NEWS = 2.0
 LINEAR = 0.5
 #: share of what a linear change leaves that a bent G and another effect must not exceed
 BENT = 0.25
-#: share that a candidate must gain to be fitted jointly, and the most candidates of a round
+#: share that a first candidate must gain to be fitted jointly, and the most candidates of a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
 #: share of the gain of the best after a few iterations below which a fit is not brought to its end
 WORTH_END = 0.5
@@ -140,6 +140,9 @@ OF_LEAST = 0.01
 #: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
 #: round are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
+#: ratio to what was left before up to which the trial beside a sum of plays is a start: of 97 such
+#: starts on simulated stages ten that clearly won left less, and one left more
+PLAIN_START = 1.6
 #: ratio to what the last of those leaves up to which another one is fitted to the end, too
 LEVEL = 1.05
 #: passes with fresh columns at the end, at most, and the gain that makes another worth it

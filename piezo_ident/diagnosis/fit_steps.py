@@ -133,7 +133,7 @@ def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:
         own = np.concatenate([moving[part].T, e[None, part]]).T
         return columns[part].T @ own, own.T @ own
 
-    # a library that is kept to one thread uses one processor
+    # the command line and the nodes keep BLAS to one thread
     half = e.size // 2
     with ThreadPoolExecutor(2) as pool:
         first, second = pool.map(of, (slice(half), slice(half, None)))

@@ -184,7 +184,7 @@ class ForwardSelection:
         """Return what tests of their own have shown, and the fit with that."""
         shown = list[Round]()
         for name in self._certain:
-            this = self._round(fitted, [e for e in self._candidates if e.name == name])
+            this = self._round(fitted, [e for e in self._candidates if e.name == name], worth=0.0)
             # what one leaves by its form is no line of its own
             form = (1.0 - criteria.LAW_FITS) * max((one.gain for one in shown), default=0.0)
             if this.contenders and (not shown or this.gain > max(form, self._indistinct)):
@@ -325,20 +325,20 @@ class ForwardSelection:
     def _left(self, this: Round) -> float:
         return self._beyond_noise(this.contenders[0] if this.contenders else this.before)
 
-    def _round(self, fitted: Fitted, effects: Sequence[type[Effect]] | None = None) -> Round:
+    def _round(
+        self, fitted: Fitted, effects: Sequence[type[Effect]] | None = None, **shares: float
+    ) -> Round:
         have = self._have | {added.name for added in fitted.state.effects}
         chosen = self._allowed if effects is None else effects
         candidates = [effect for effect in chosen if effect.name not in have]
-        done = self._count
-        self._count += 1
+        done, self._count = self._count, self._count + 1
 
         def tick(share: float) -> None:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        first = all(added.name in TESTED for added in fitted.state.effects)
-        fixed = self._lines, self._noise, self._rng
-        return search_round(self._simulator, fitted, candidates, *fixed, tick, first=first)
+        sim, lines, noise, rng = self._simulator, self._lines, self._noise, self._rng
+        return search_round(sim, fitted, candidates, lines, noise, rng, tick, **shares)
 
     def _from(
         self, start: Fitted, first: Round, shown: Sequence[Round], bent: Round | None = None
@@ -362,7 +362,10 @@ class ForwardSelection:
                 fitted = polished(self._simulator, fitted, self._lines, self._noise, self._alive)
             if len(taken) == self._most or self._beyond_noise(fitted) < smallest:
                 break
-            this = self._round(fitted)
+            is_further = len(taken) > len(shown)
+            this = self._round(
+                fitted, promise=criteria.LEAST_GAIN if is_further else criteria.WORTH_FIT
+            )
             rounds.append(this)
         if len(fitted.state.effects) > 1:
             # of the others the rounds have asked whether they are needed, of the last one not yet

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-G, and creep in front of it, of which only the means of rows are wanted.
+G, creep in front of it and a short delay, of which only the means of rows are wanted.
 
 Most of what a fit asks of G is means of some samples in a row.  The state of G then steps from
 one group of rows to the next, and what the samples in between add is a product of matrices: that

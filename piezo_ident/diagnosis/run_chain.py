@@ -69,7 +69,7 @@ class RunChain:
         behind = self.behind(place_of_core(self.operators) + 1, m)
         if not behind.bends:
             return [behind.rows(slope) for slope in slopes]
-        sizes = [max(float(np.abs(slope).max(initial=0.0)), SMALL) / SMALL for slope in slopes]
+        sizes = [max(float(np.abs(x).max(initial=0.0)), SMALL**2) / SMALL for x in slopes]
         return [size * behind.rows(x / size) for x, size in zip(slopes, sizes, strict=True)]
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:

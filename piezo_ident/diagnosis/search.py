@@ -77,13 +77,15 @@ def search_round(
     rng: np.random.Generator,
     tick: Tick,
     *,
-    first: bool,
+    promise: float = criteria.WORTH_FIT,
+    worth: float = criteria.LEAST_GAIN,
 ) -> Round:
     """
     Score all candidates and fit the best of them jointly.
 
     `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
-    `rng` draws the shifts of the surrogates.  A `first` effect may promise little at its trial.
+    `rng` draws the shifts of the surrogates.  `promise` and `worth` are shares of what is left
+    that a candidate must gain at its trial, and has to reach to be fitted on.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * criteria.SURROGATES)
@@ -106,8 +108,7 @@ def search_round(
         scores.sort(key=lambda s: s.error)
     best = {name: scores[0] for name, scores in trials.items()}
     total = float(before.errors.sum())
-    least = criteria.WORTH_FIT if first else criteria.LEAST_GAIN
-    least *= max(total - noise * n, 1e-300)
+    least = promise * max(total - noise * n, 1e-300)
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
     chosen = promising[: criteria.JOINT_FITS]
@@ -128,7 +129,8 @@ def search_round(
         for scores in chosen
     ]
     _add_plain_starts(simulator, before, starts, lines)
-    contenders, warnings = _contenders(simulator, before, starts, noise, tick)
+    goal = before.mean_square - worth * max(before.mean_square - noise, 0.0)
+    contenders, warnings = _contenders(simulator, before, starts, noise, goal, tick)
     tick(1.0)
     return Round(
         before=before,
@@ -161,7 +163,7 @@ def _add_plain_starts(
     plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), enough=enough)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
     best = best_trials(simulator, plain, [effect for effect, _ in starts], lines)
-    most = criteria.AHEAD * float(before.errors.sum())
+    most = criteria.PLAIN_START * float(before.errors.sum())
     for effect, states in starts:
         one = best.get(effect.name)
         if one is not None and (one.error < most or not one.trial.moves):
@@ -173,14 +175,17 @@ def _contenders(
     before: Fitted,
     starts: Sequence[tuple[type[Effect], Sequence[State]]],
     noise: float,
+    worth: float,
     tick: Tick,
 ) -> tuple[list[Fitted], list[str]]:
-    """Return the candidates that show, fitted jointly, best first, and the fits that failed."""
+    """
+    Return the candidates that show, fitted jointly, best first, and the fits that failed.
+
+    What will not reach the mean square `worth` is not fitted on.
+    """
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
     at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
-    # what gains less is no effect
-    worth = least - criteria.LEAST_GAIN * max(least - noise, 0.0)
 
     def alive() -> None:
         tick(at)

@@ -89,7 +89,7 @@ def toward_given(
         # one that would leave more stays behind
         goal = fitted.mean_square / (1.0 - criteria.BENT_H)
         beside = fit_jointly(simulator, known, base_at(simulator, known), goal=goal, tick=tick)
-        if fitted.errors.sum() > (1.0 - criteria.BENT_H) * beside.errors.sum():
+        if beside.reached < goal:
             known = replace(beside.state, retuning=())
             plain = fit_jointly(simulator, known, beside.base, tick=tick)
             return beside if is_better(beside, plain) else plain

@@ -149,15 +149,13 @@ class _Columns:
         count = len(rows.names)
         if effect is not self._effect:
             self._effect, self._kept = effect, {}
-        settings = {
-            tuple(np.asarray(value).tobytes() for value in setting.values()): setting
-            for setting in trial.settings()
-        }
-        new = [key for key in settings if key not in self._kept]
-        added = [Added(effect.name, (settings[key],) * count) for key in new]
+        settings = trial.settings()
+        keys = [tuple(np.asarray(x).tobytes() for x in setting.values()) for setting in settings]
+        new = {k: s for k, s in zip(keys, settings, strict=True) if k not in self._kept}
+        added = [Added(effect.name, (setting,) * count) for setting in new.values()]
         self._kept |= dict(zip(new, self._simulator.added(added), strict=True))
         columns = []
-        for key in settings:
+        for key in keys:
             column = self._kept[key]
             if column is None:
                 return None

@@ -153,7 +153,7 @@ class Effect:
         the same as long as it is small; or ``bent``.
     of_hysteresis : str
         How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
-        ``not``, ``linear`` (by `of_parts`) or ``bent``.
+        ``not``, ``linear`` or ``bent``.
     in_delay_line : bool
         Whether it is not an operator but a change of the model's delay, by `added_delay`.
 
@@ -350,10 +350,12 @@ class Effect:
         """
         Give what H would become if it were one part of it alone, for each; shapes (n,).
 
-        For effects whose `of_hysteresis` is ``linear``.  Each part, plays alone or without any,
-        comes with the outputs of its plays before the block, and `rest` is the signal at rest.
+        Each part, plays alone or without any, comes with the outputs of its plays at `rest`.
         """
-        raise NotImplementedError
+        for h, memory in parts:
+            operator = type(self)(self.sample_rate, self.values, h, HysteresisOperator(h, memory))
+            operator.reset(float(block.v[0]), rest)
+            yield operator.process(block).x
 
     def number(self, name: str) -> float:
         """Return a scalar parameter."""

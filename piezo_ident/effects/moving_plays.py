@@ -128,6 +128,7 @@ def growth_slopes(
     By gain, stretch, lead and lead_stretch, and by three numbers that shape the power: `bends`,
     shape (3, n), are the derivatives of the power by these.
     """
+    # the three are written out, so that the loops over plays run in vector lanes
     # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
     n_r = r.size
     by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)

@@ -158,9 +158,7 @@ class RateDependentHysteresis(Effect):
         power = self.power(v, rest)
         for h, memory in parts:
             if not h.thresholds.size:
-                still = HysteresisOperator(h, memory)
-                still.reset(float(block.v[0]), rest)
-                yield still.process(block).x
+                yield from super().of_parts(block, rest, [(h, memory)])
                 continue
             r, q, *_, low, c = h.for_kernel
             moved = np.zeros(r.size)

@@ -122,6 +122,20 @@ def test_a_gain_that_follows_time_scales_changes_of_any_size():
     assert np.ptp(found) > 0.1
 
 
+def test_a_gain_that_follows_time_comes_to_rest_as_it_does():
+    m, rate = 4, 20_000.0
+    x = motion(4000)
+    block = Block(t=100.0 + np.arange(x.size) / rate, v=x, x=x, channels={})
+    drift = find_effect('gain_drift')
+    values = drift.check({'time': [1.0, 200.0], 'gain': [0.0, 0.2]})
+    links = [drift(rate, values), DelayOperator(Delay(8))]
+    change = np.ones(x.size)
+    found = Behind(links, [0.0] * 3, [block] * 3, m).rows(change, 1.0)
+    links[1].reset(0.0, links[0].reset(0.0, 1.0))
+    passed = links[1].process(links[0].process(block.with_signal(change)))
+    np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
+
+
 def test_a_curve_behind_g_passes_small_changes_by_its_slope():
     m, rate = 4, 20_000.0
     x = motion(120_011, 0.4)

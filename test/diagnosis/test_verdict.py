@@ -371,18 +371,24 @@ def test_what_explains_little_after_a_few_iterations_is_not_fitted_to_the_end(
     fits = {
         name: contender(name, x) for name, x in zip(('creep', 'backlash'), shares, strict=True)
     }
-    seen = []
+    seen = {}
     monkeypatch.setattr(search, 'fit_jointly', lambda s, state, *_, **__: fits[state])
     monkeypatch.setattr(search, 'shows', lambda *_: is_shown)
     monkeypatch.setattr(
-        search, '_to_the_end', lambda s, c, *_: seen.append(c.name) or contender(c.name, 0.01)
+        search,
+        '_to_the_end',
+        lambda s, c, noise, goal, _: seen.setdefault(c.name, goal) and contender(c.name, 0.01),
     )
     before = SimpleNamespace(mean_square=WHOLE, base=None)
     starts = [(SimpleNamespace(name=name), [name]) for name in fits]
     simulator = SimpleNamespace(rows=rows)
     simulator.copies = lambda _: [simulator]
-    search._contenders(simulator, before, starts, 0.0, lambda _: None)
-    assert seen == ended
+    worth = 0.9 * WHOLE
+    search._contenders(simulator, before, starts, 0.0, worth, lambda _: None)
+    assert list(seen) == ended
+    # what will not gain enough is left, and a rival that stays further behind the first
+    assert seen['creep'] == worth
+    assert 'backlash' not in seen or (seen['backlash'] < worth) == is_shown
 
 
 def test_what_the_data_cannot_show_is_no_candidate_unless_it_may_hide(rows):
@@ -494,7 +500,7 @@ def test_what_another_axis_leaves_by_its_form_is_no_line(rows, left, names):
             contender('periodic_disturbance', left), before=0.02 * WHOLE
         ),
     }
-    search._round = lambda start, effects: rounds[effects[0].name]
+    search._round = lambda start, effects, **_: rounds[effects[0].name]
     shown, last = search._of_tests(None)
     assert [this.contenders[0].name for this in shown] == (names or list(search._certain))
     assert last is shown[-1].contenders[0]

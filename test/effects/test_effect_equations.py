@@ -194,6 +194,8 @@ def test_rate_dependence_of_parts_of_h_adds_up(name):
     operator.reset(u[0], u[0])
     parts = ((part, start[own]) for part, own in law.parts(range(law.size)))
     found = np.array(list(operator.of_parts(block, u[0], parts)))
+    again = ((part, start[own]) for part, own in law.parts(range(law.size)))
+    assert_allclose(found, list(Effect.of_parts(operator, block, u[0], again)), atol=1e-12)
     assert_allclose(theta @ found, operator.process(block).x, atol=1e-12)
     assert np.abs(theta @ found - h(u, start)).max() > 1e-3
 
