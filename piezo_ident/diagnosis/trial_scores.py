@@ -11,7 +11,6 @@ blocks in addition to all that is in the model already.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,8 +87,10 @@ def score_trials(
     alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)
     view = _view_of(simulator, lines)
     trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
-    for done, (effect, trial, C) in enumerate(_with_columns(simulator, trials)):
+    columns = _Columns(simulator)
+    for done, (effect, trial) in enumerate(trials):
         tick(done / len(trials))
+        C = columns.of(effect, trial)
         if C is None or not np.all(np.isfinite(C)) or not np.any(C):
             continue
         both = with_columns(rows, equations, M, C, E)
@@ -115,19 +116,6 @@ def best_trials(
         if scored.is_possible and (name not in best or scored.error < best[name].error):
             best[name] = scored
     return best
-
-
-def _with_columns(
-    simulator: Simulator, trials: Sequence[tuple[type[Effect], Trial]]
-) -> Iterator[tuple[type[Effect], Trial, Array | None]]:
-    """Give each trial with its columns; those of the next one are made meanwhile."""
-    columns = _Columns(simulator)
-    with ThreadPoolExecutor(1) as thread:
-        coming = [thread.submit(columns.of, *trial) for trial in trials[:1]]
-        for k, (effect, trial) in enumerate(trials):
-            found = coming.pop().result()
-            coming += [thread.submit(columns.of, *after) for after in trials[k + 1 : k + 2]]
-            yield effect, trial, found
 
 
 class _Columns:
