@@ -45,6 +45,11 @@ def ordered_kernel(function: F) -> F:
     return _compiled(function)
 
 
+def part_of_kernels(function: F) -> F:
+    """Put a function into each kernel that calls it, as if it were written there."""
+    return cast(F, njit(inline='always')(function))
+
+
 def _compiled(function: F, **options: Any) -> F:
     try:
         made = njit(cache=True, nogil=True, **options)(function)

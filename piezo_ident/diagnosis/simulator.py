@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 import functools
 from functools import partial
+import itertools
 import os
 from typing import Any, TypeVar
 
@@ -335,17 +336,18 @@ class Simulator:
         """Return the columns that a function of a run and of their places gives, and more."""
         keep = self.rows.keep
         ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
-        # all processors share a run alone
+        # all processors share a run alone; columns that follow each other may run side by side
         share = -(-self._threads // len(keep))
-        tasks = [
-            (i, range(k, size, share)) for i in range(len(keep)) for k in range(min(share, size))
-        ]
+        cuts = [size * k // share for k in range(share + 1)]
+        tasks = [(i, range(*cut)) for i in range(len(keep)) for cut in itertools.pairwise(cuts)]
         extra = np.empty((0, self.rows.n)) if more is None else more
         whole = np.empty((size + extra.shape[0], self.rows.n))
         whole[size:] = extra
 
         def fill(task: tuple[int, range]) -> None:
             i, places = task
+            if not places:
+                return
             columns = function(i, places)
             own = columns if keep[i].all() else columns[:, keep[i]]
             whole[places, ends[i] : ends[i + 1]] = own

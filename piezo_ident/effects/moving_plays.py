@@ -16,19 +16,16 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel
 from piezo_ident.operators.kernels import curve, curve_slope, held
+from piezo_ident.operators.parts import four_sums
+
+#: growth of the lower edge, even and relative, and of the upper one
+Growth = tuple[float, float, float, float]
 
 
 @ordered_kernel
-def _edges(
-    x: float,
-    r: float,
-    power: float,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
-) -> tuple[float, float]:
+def _edges(x: float, r: float, power: float, growth: Growth) -> tuple[float, float]:
     """Return the edges of the band of a play; where they cross, the lower one counts."""
+    gain, stretch, lead, lead_stretch = growth
     width = r * (1.0 + stretch * power) + gain * power
     low = x - (width if width > 0.0 else 0.0)
     high = x + r * (lead_stretch * power) + lead * power
@@ -43,10 +40,7 @@ def growth_of_plays(
     low_v: float,
     c: Array,
     power: Array,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
+    growth: Growth,
     memory: Array,
     still: Array,
     out: Array,
@@ -65,7 +59,7 @@ def growth_of_plays(
         for i in range(n_r):
             still[i] = held(still[i], x - r[i], x)
         for i in range(n_r):
-            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            low, high = _edges(x, r[i], p, growth)
             memory[i] = held(memory[i], low, high)
         for i in range(n_r):
             w += q[i] * (memory[i] - still[i])
@@ -76,34 +70,34 @@ def growth_of_plays(
         out[k] = w
 
 
+@ordered_kernel
+def moved_play(v: Array, r: float, power: Array, growth: Growth, f: float, out: Array) -> None:
+    """Write a play whose threshold grows into `out`, shape (n,), from its output f before."""
+    for k in range(v.size):
+        low, high = _edges(v[k], r, power[k], growth)
+        f = held(f, low, high)
+        out[k] = f
+
+
 @kernel
-def moved_plays(
+def moved_plays_apart(
     v: Array,
     r: Array,
-    q: Array,
     low_v: float,
+    q: Array,
     c: Array,
     power: Array,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
+    growth: Growth,
     memory: Array,
     out: Array,
 ) -> None:
-    """Write the sum of all plays whose thresholds grow into `out`; see `growth_of_plays`."""
+    """Write four sums of plays whose thresholds grow into `out`, shape (4, n); see `four_sums`."""
     for k in range(v.size):
         x, p = v[k], power[k]
-        w = 0.0
         for i in range(r.size):
-            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            low, high = _edges(x, r[i], p, growth)
             memory[i] = held(memory[i], low, high)
-        for i in range(r.size):
-            w += q[i] * memory[i]
-        if c.shape[0]:
-            for i in range(r.size):
-                w += c[3, i] * (x - low_v) * (memory[i] - low_v) + curve(c, i, memory[i] - low_v)
-        out[k] = w
+        out[0, k], out[1, k], out[2, k], out[3, k] = four_sums(low_v, q, c, memory)
 
 
 @kernel
@@ -115,29 +109,26 @@ def growth_slopes(
     c: Array,
     power: Array,
     bends: Array,
-    gain: float,
-    stretch: float,
-    lead: float,
-    lead_stretch: float,
+    growth: Growth,
     memory: Array,
     out: Array,
 ) -> None:
     """
-    Write the derivatives of what `moved_plays` does into `out`, shape (7, n).
+    Write the derivatives of what `growth_of_plays` does into `out`, shape (7, n).
 
     By gain, stretch, lead and lead_stretch, and by three numbers that shape the power: `bends`,
     shape (3, n), are the derivatives of the power by these.
     """
     # the three are written out, so that the loops over plays run in vector lanes
     # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
-    n_r = r.size
+    n_r, (gain, stretch, lead, lead_stretch) = r.size, growth
     by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
     one, two, three = np.zeros(n_r), np.zeros(n_r), np.zeros(n_r)
     for k in range(v.size):
         x, p = v[k], power[k]
         bend_1, bend_2, bend_3 = bends[0, k], bends[1, k], bends[2, k]
         for i in range(n_r):
-            low, high = _edges(x, r[i], p, gain, stretch, lead, lead_stretch)
+            low, high = _edges(x, r[i], p, growth)
             f = memory[i]
             new = held(f, low, high)
             memory[i] = new

@@ -14,12 +14,21 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.moving_plays import (
     growth_of_plays,
     growth_slopes,
-    moved_plays,
+    moved_play,
+    moved_plays_apart,
     speed_of,
 )
 from piezo_ident.operators.c_code import CCode, Numbers
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator, LANES
+from piezo_ident.operators.parts import (
+    columns_of_parts,
+    has_curves_alone,
+    in_groups,
+    is_single_play,
+    SIDE_BY_SIDE,
+    weights_of,
+)
 
 #: relative step of the low-pass of the speed, for the slope of the power
 NEAR = 1e-5
@@ -126,18 +135,7 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = self.hysteresis.for_kernel
         power = self._power(v, self._speed)
         more = np.empty(v.size)
-        growth_of_plays(
-            v,
-            r,
-            q,
-            low,
-            c,
-            power,
-            *self._growth,
-            self._memory,
-            self._still,
-            more,
-        )
+        growth_of_plays(v, r, q, low, c, power, self._growth, self._memory, self._still, more)
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
 
@@ -147,7 +145,7 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = self.hysteresis.for_kernel
         power, bends = self._bent_power(v)
         out = np.empty((len(AMPLITUDES) + len(SHAPE), v.size))
-        growth_slopes(v, r, q, low, c, power, bends, *self._growth, self._memory.copy(), out)
+        growth_slopes(v, r, q, low, c, power, bends, self._growth, self._memory.copy(), out)
         return dict(zip((*AMPLITUDES, *SHAPE), out, strict=True))
 
     def of_parts(
@@ -156,16 +154,25 @@ class RateDependentHysteresis(Effect):
         """Give what each part of H becomes; see `Effect.of_parts`."""
         v = np.ascontiguousarray(block.x)
         power = self.power(v, rest)
-        for h, memory in parts:
+        for group in in_groups(parts):
+            h, memory = group[0]
             if not h.thresholds.size:
-                yield from super().of_parts(block, rest, [(h, memory)])
-                continue
-            r, q, *_, low, c = h.for_kernel
-            moved = np.zeros(r.size)
-            moved[: memory.size] = memory
-            out = np.empty(v.size)
-            moved_plays(v, r, q, low, c, power, *self._growth, moved, out)
-            yield out
+                # nothing grows
+                yield from columns_of_parts(v, group)
+            elif is_single_play(h):
+                for one, start in group:
+                    out = np.empty(v.size)
+                    moved_play(v, one.thresholds[0], power, self._growth, start[0], out)
+                    yield one.weights[0] * out
+            elif has_curves_alone(h):
+                r, *_, low, _ = h.for_kernel
+                moved, outs = np.zeros(r.size), np.empty((SIDE_BY_SIDE, v.size))
+                moved[: memory.size] = memory
+                q, curves = weights_of(group)
+                moved_plays_apart(v, r, low, q, curves, power, self._growth, moved, outs)
+                yield from outs[: len(group)]
+            else:
+                yield from super().of_parts(block, rest, group)
 
     def c_code(self) -> CCode:
         """Return the effect in C."""

@@ -31,7 +31,8 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, frozen_array, Integers, Mask
 from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.hysteresis import Hysteresis, POWERS
-from piezo_ident.operators.play import play_columns
+from piezo_ident.operators.parts import columns_of_parts
+from piezo_ident.operators.play import initial_memory
 from scipy.optimize import lsq_linear
 
 LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'any']
@@ -181,9 +182,14 @@ class HysteresisLaw:
 
     def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, Mask]]:
         """Give the H of each coefficient in some places alone, and which thresholds it has."""
+        return (self._parts[place] for place in places)
+
+    @functools.cached_property
+    def _parts(self) -> tuple[tuple[Hysteresis, Mask], ...]:
         r, m = self.thresholds, self.thresholds.size
         n = (POWERS + 2) * m
-        for row in self._parameters[list(places)]:
+        found = []
+        for row in self._parameters:
             plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
             moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
             rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])
@@ -199,7 +205,8 @@ class HysteresisLaw:
                 span=self.span,
                 relaxations=np.column_stack([rates, lags])[chosen] if chosen.any() else None,
             )
-            yield part, moved
+            found.append((part, moved))
+        return tuple(found)
 
     def columns(
         self, v: Array, memory: ArrayLike | None = None, places: Sequence[int] | None = None
@@ -211,13 +218,10 @@ class HysteresisLaw:
         that last came down to zero when absent; `places` are the coefficients that are wanted, all
         when absent.
         """
-        start = None if memory is None else np.asarray(memory, dtype=np.float64)
+        start = initial_memory(float(v[0]), self.thresholds) if memory is None else memory
+        start = np.asarray(start, dtype=np.float64)
         places = range(self.size) if places is None else places
-        for i, (part, moved) in zip(places, self.parts(places), strict=True):
-            own = None if start is None else start[moved]
-            # a single play runs faster by itself
-            single = i < self.thresholds.size
-            yield play_columns(v, part.thresholds, own)[0] if single else part(v, own)
+        return columns_of_parts(v, ((part, start[own]) for part, own in self.parts(places)))
 
     def within(self, wider: HysteresisLaw) -> Integers:
         """

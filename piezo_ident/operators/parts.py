@@ -1,0 +1,162 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What parts of H make of one input, each alone.
+
+A fit asks for a column for each coefficient of a law of H.  Parts that follow each other often
+hold the same plays, with other curves, or lags of one rate: those run side by side, so that plays
+and exponentials are computed once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+import itertools
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.kernel import kernel, ordered_kernel, part_of_kernels
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.kernels import held, path_lines
+from piezo_ident.operators.play import play_columns
+
+#: parts that run side by side
+SIDE_BY_SIDE = 4
+
+#: a part of H, and the outputs of its plays before the first sample, shape (m,)
+Part = tuple[Hysteresis, Array]
+
+
+def in_groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
+    """Give up to `SIDE_BY_SIDE` parts in a row that hold the same plays, or lags of one rate."""
+    for _, some in itertools.groupby(parts, lambda part: _kind(part[0])):
+        group = list(some)
+        for k in range(0, len(group), SIDE_BY_SIDE):
+            yield group[k : k + SIDE_BY_SIDE]
+
+
+def has_curves_alone(h: Hysteresis) -> bool:
+    """Return whether H is plays with curves, and no more."""
+    others = (h.p0, h.p1, h.p2) == (0.0, 0.0, 0.0) and h.bias is None and h.relaxations is None
+    return others and h.curves is not None and h.thresholds.size > 0
+
+
+def is_single_play(h: Hysteresis) -> bool:
+    """Return whether H is one play, and no more."""
+    return h.is_plain and h.thresholds.size == 1 and (h.p1, h.p2) == (0.0, 0.0)
+
+
+def weights_of(group: list[Part]) -> tuple[Array, Array]:
+    """
+    Return weights and curves of a group as `four_sums` takes them.
+
+    Shapes (`SIDE_BY_SIDE`, m) and (`SIDE_BY_SIDE`, 5, m), m with idle plays; parts that are
+    missing weigh nothing.
+    """
+    r, *_, c = group[0][0].for_kernel
+    q, curves = np.zeros((SIDE_BY_SIDE, r.size)), np.zeros((SIDE_BY_SIDE, *c.shape))
+    for j, (h, _) in enumerate(group):
+        q[j], curves[j] = h.for_kernel[1], h.for_kernel[-1]
+    return q, curves
+
+
+def columns_of_parts(v: Array, parts: Iterable[Part]) -> Iterator[Array]:
+    """
+    Give what each part of H makes of a normalised input; shapes (n,).
+
+    Lags along the path begin as `Hysteresis.settled` at the first input.
+
+    Examples
+    --------
+    >>> parts = [(Hysteresis([0.5], [q], 0.0, 0.0), np.zeros(1)) for q in (1.0, 2.0)]
+    >>> [column.tolist() for column in columns_of_parts(np.array([0.0, 1.0]), parts)]
+    [[0.0, 0.5], [0.0, 1.0]]
+    """
+    x = np.ascontiguousarray(v)
+    for group in in_groups(parts):
+        h, memory = group[0]
+        if has_curves_alone(h):
+            r, _, *_, low, _ = h.for_kernel
+            held_at = np.zeros(r.size)
+            held_at[: memory.size] = memory
+            out = np.empty((SIDE_BY_SIDE, x.size))
+            _plays_apart(x, r, low, *weights_of(group), held_at, out)
+            yield from out[: len(group)]
+        elif is_single_play(h):
+            # a play runs faster by itself
+            for one, start in group:
+                yield one.weights[0] * play_columns(x, one.thresholds, start)[0]
+        elif _is_lags_alone(h):
+            rows = [row for one, _ in group for row in one.relaxations]  # type: ignore[union-attr]
+            whole = replace(h, relaxations=np.array(rows))
+            out = np.empty((len(rows), x.size))
+            _lags_apart(x, np.array(whole.relaxations), whole.settled(float(x[0])), out)
+            yield from out
+        else:
+            yield from (one(x, start) for one, start in group)
+
+
+def _kind(h: Hysteresis) -> tuple[object, ...]:
+    rates = b'' if h.relaxations is None else h.relaxations[:, 0].tobytes()
+    return has_curves_alone(h), _is_lags_alone(h), h.span, h.thresholds.tobytes(), rates
+
+
+def _is_lags_alone(h: Hysteresis) -> bool:
+    alone = h.thresholds.size == 0 and (h.p0, h.p1, h.p2) == (0.0, 0.0, 0.0)
+    return alone and h.relaxations is not None and len(h.relaxations) == 1
+
+
+@part_of_kernels
+def four_sums(low: float, q: Array, c: Array, memory: Array) -> tuple[float, float, float, float]:
+    """
+    Return ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
+
+    psi is `piezo_ident.operators.kernels.curve`; q and c are those of `weights_of`.
+    """
+    # written out, so that the loop over plays runs in vector lanes
+    s_0, s_1, s_2, s_3 = 0.0, 0.0, 0.0, 0.0
+    for i in range(memory.size):
+        f = memory[i]
+        t = held(f - low, 0.0, c[0, 4, i])
+        u = t * t
+        s_0 += q[0, i] * f + u * (c[0, 0, i] + t * (c[0, 1, i] + t * c[0, 2, i]))
+        s_1 += q[1, i] * f + u * (c[1, 0, i] + t * (c[1, 1, i] + t * c[1, 2, i]))
+        s_2 += q[2, i] * f + u * (c[2, 0, i] + t * (c[2, 1, i] + t * c[2, 2, i]))
+        s_3 += q[3, i] * f + u * (c[3, 0, i] + t * (c[3, 1, i] + t * c[3, 2, i]))
+    return s_0, s_1, s_2, s_3
+
+
+@kernel
+def _plays_apart(
+    v: Array, r: Array, low: float, q: Array, c: Array, memory: Array, out: Array
+) -> None:
+    for k in range(v.size):
+        x = v[k]
+        for i in range(r.size):
+            memory[i] = held(memory[i], x - r[i], x)
+        out[0, k], out[1, k], out[2, k], out[3, k] = four_sums(low, q, c, memory)
+
+
+@ordered_kernel
+def _lags_apart(v: Array, x: Array, state: Array, out: Array) -> None:
+    # as `piezo_ident.operators.kernels.relaxing`, of lags of one rate that are not added up
+    n = x.shape[0]
+    lines = path_lines(x)
+    last = float(state[n])
+    for k in range(v.size):
+        u = float(v[k])
+        length = abs(u - last)
+        line = lines[1 if u > last else 0]
+        left = np.exp(-x[0, 0] * length) if length > 0.0 else 1.0
+        for j in range(n):
+            d1, d2, d3 = x[j, 1], x[j, 2], x[j, 3]
+            if length > 0.0:
+                c0, c1, c2 = line[0, j], line[1, j], line[2, j]
+                new = c0 + u * (c1 + u * (c2 + u * d3))
+                old = c0 + last * (c1 + last * (c2 + last * d3))
+                state[j] = new + (state[j] - old) * left
+            out[j, k] = state[j] - u * (d1 + u * (d2 + u * d3))
+        last = u
+    state[n] = last

@@ -1,0 +1,36 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parts of H that run side by side."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.parts import columns_of_parts, in_groups, SIDE_BY_SIDE
+import pytest
+
+
+@pytest.mark.parametrize('name', ['plays', 'square', 'bias', 'preisach', 'duhem', 'any'])
+def test_each_part_is_what_it_makes_alone(name):
+    rng = np.random.default_rng(3)
+    law = HysteresisLaw(name, np.linspace(0.05, 0.9, 11), (-0.1, 1.1))
+    v = np.cumsum(rng.normal(0.0, 0.05, 2000)) % 1.0
+    start = v[0] - rng.random(11) * law.thresholds
+    parts = [(h, start[own]) for h, own in law.parts(range(law.size))]
+    alone = [h(v, memory) for h, memory in parts]
+    assert_allclose(list(columns_of_parts(v, parts)), alone, rtol=1e-12, atol=1e-14)
+    # some alone, and in another order
+    some = rng.permutation(law.size)[: law.size // 2]
+    found = list(columns_of_parts(v, [parts[i] for i in some]))
+    assert_allclose(found, [alone[i] for i in some], rtol=1e-12, atol=1e-14)
+
+
+def test_parts_of_the_same_plays_run_together():
+    law = HysteresisLaw('duhem', np.linspace(0.05, 0.9, 11))
+    parts = [(h, np.zeros(int(own.sum()))) for h, own in law.parts(range(law.size))]
+    groups = list(in_groups(parts))
+    assert [part for group in groups for part in group] == parts
+    curved = [group for group in groups if group[0][0].curves is not None]
+    assert [len(group) for group in curved] == [SIDE_BY_SIDE] * 5
+    for group in groups:
+        assert all(np.array_equal(h.thresholds, group[0][0].thresholds) for h, _ in group)
