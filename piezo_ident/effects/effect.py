@@ -149,8 +149,7 @@ class Effect:
     change : str
         What it makes of a small change of its signal: ``passed`` as it is, where the effect only
         adds something of its own; ``filtered``, the same whatever the signal and whenever;
-        ``linear``, the same whatever the signal; ``scaled``, its `slope` times it; ``curved``,
-        the same as long as it is small; or ``bent``.
+        ``scaled``, its `slope` times it; ``curved``, the same as long as it is small; or ``bent``.
     of_hysteresis : str
         How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
         ``not``, ``linear`` or ``bent``.
@@ -183,7 +182,7 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
-    change: ClassVar[Literal['passed', 'filtered', 'linear', 'scaled', 'curved', 'bent']] = 'bent'
+    change: ClassVar[Literal['passed', 'filtered', 'scaled', 'curved', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
 
