@@ -31,7 +31,7 @@ Part = tuple[Hysteresis, Array]
 
 def in_groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
     """Give up to `SIDE_BY_SIDE` parts in a row that hold the same plays, or lags of one rate."""
-    for _, some in itertools.groupby(parts, lambda part: _kind(part[0])):
+    for _, some in itertools.groupby(parts, _kind):
         group = list(some)
         for k in range(0, len(group), SIDE_BY_SIDE):
             yield group[k : k + SIDE_BY_SIDE]
@@ -98,9 +98,11 @@ def columns_of_parts(v: Array, parts: Iterable[Part]) -> Iterator[Array]:
             yield from (one(x, start) for one, start in group)
 
 
-def _kind(h: Hysteresis) -> tuple[object, ...]:
+def _kind(part: Part) -> tuple[object, ...]:
+    h, memory = part
     rates = b'' if h.relaxations is None else h.relaxations[:, 0].tobytes()
-    return has_curves_alone(h), _is_lags_alone(h), h.span, h.thresholds.tobytes(), rates
+    form = has_curves_alone(h), is_single_play(h), _is_lags_alone(h)
+    return form, h.span, h.thresholds.tobytes(), rates, memory.tobytes()
 
 
 def _is_lags_alone(h: Hysteresis) -> bool:

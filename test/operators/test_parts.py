@@ -3,19 +3,23 @@
 
 """Parts of H that run side by side."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.testing import assert_allclose
+from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.operators.parts import columns_of_parts, in_groups, SIDE_BY_SIDE
 import pytest
 
 
+@pytest.mark.parametrize('plays', [1, 2, 11])
 @pytest.mark.parametrize('name', ['plays', 'square', 'bias', 'preisach', 'duhem', 'any'])
-def test_each_part_is_what_it_makes_alone(name):
+def test_each_part_is_what_it_makes_alone(name, plays):
     rng = np.random.default_rng(3)
-    law = HysteresisLaw(name, np.linspace(0.05, 0.9, 11), (-0.1, 1.1))
+    law = HysteresisLaw(name, np.linspace(0.05, 0.9, plays), (-0.1, 1.1))
     v = np.cumsum(rng.normal(0.0, 0.05, 2000)) % 1.0
-    start = v[0] - rng.random(11) * law.thresholds
+    start = v[0] - rng.random(plays) * law.thresholds
     parts = [(h, start[own]) for h, own in law.parts(range(law.size))]
     alone = [h(v, memory) for h, memory in parts]
     assert_allclose(list(columns_of_parts(v, parts)), alone, rtol=1e-12, atol=1e-14)
@@ -23,6 +27,16 @@ def test_each_part_is_what_it_makes_alone(name):
     some = rng.permutation(law.size)[: law.size // 2]
     found = list(columns_of_parts(v, [parts[i] for i in some]))
     assert_allclose(found, [alone[i] for i in some], rtol=1e-12, atol=1e-14)
+
+
+def test_parts_of_another_form_or_state_run_apart():
+    v = np.array([0.5, 0.6, 0.3, 0.9])
+    play = Hysteresis([0.2], [1.0], 0.0, 0.0)
+    others = [replace(play, p2=0.5), replace(play, bias=[0.3]), replace(play, curves=[[0.4]])]
+    hs = [play, *others, play, Hysteresis([0.2], [0.5], 0.0, 0.0, curves=[[0.1]])]
+    parts = [(h, np.array([start])) for h in hs for start in (0.3, 0.5)]
+    alone = [h(v, start) for h, start in parts]
+    assert_allclose(list(columns_of_parts(v, parts)), alone, rtol=1e-12)
 
 
 def test_parts_of_the_same_plays_run_together():
