@@ -26,6 +26,7 @@ from piezo_ident.operators.parts import (
     has_curves_alone,
     in_groups,
     is_single_play,
+    Part,
     SIDE_BY_SIDE,
     weights_of,
 )
@@ -155,24 +156,29 @@ class RateDependentHysteresis(Effect):
         v = np.ascontiguousarray(block.x)
         power = self.power(v, rest)
         for group in in_groups(parts):
-            h, memory = group[0]
+            h, _ = group[0]
             if not h.thresholds.size:
                 # nothing grows
-                yield from columns_of_parts(v, group)
+                yield from columns_of_parts(v, group, rest)
             elif is_single_play(h):
                 for one, start in group:
                     out = np.empty(v.size)
                     moved_play(v, one.thresholds[0], power, self._growth, start[0], out)
                     yield one.weights[0] * out
             elif has_curves_alone(h):
-                r, *_, low, _ = h.for_kernel
-                moved, outs = np.zeros(r.size), np.empty((SIDE_BY_SIDE, v.size))
-                moved[: memory.size] = memory
-                q, curves = weights_of(group)
-                moved_plays_apart(v, r, low, q, curves, power, self._growth, moved, outs)
-                yield from outs[: len(group)]
+                yield from self._moved_apart(v, power, group)
             else:
                 yield from super().of_parts(block, rest, group)
+
+    def _moved_apart(self, v: Array, power: Array, group: list[Part]) -> Array:
+        """Return what up to four parts of the same plays become, as rows."""
+        h, memory = group[0]
+        r, *_, low, _ = h.for_kernel
+        moved, out = np.zeros(r.size), np.empty((SIDE_BY_SIDE, v.size))
+        moved[: memory.size] = memory
+        q, curves = weights_of(group)
+        moved_plays_apart(v, r, low, q, curves, power, self._growth, moved, out)
+        return out[: len(group)]
 
     def c_code(self) -> CCode:
         """Return the effect in C."""

@@ -40,7 +40,7 @@ def in_groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
 def has_curves_alone(h: Hysteresis) -> bool:
     """Return whether H is plays with curves, and no more."""
     others = (h.p0, h.p1, h.p2) == (0.0, 0.0, 0.0) and h.bias is None and h.relaxations is None
-    return others and h.curves is not None and h.thresholds.size > 0
+    return others and h.curves is not None
 
 
 def is_single_play(h: Hysteresis) -> bool:
@@ -62,11 +62,13 @@ def weights_of(group: list[Part]) -> tuple[Array, Array]:
     return q, curves
 
 
-def columns_of_parts(v: Array, parts: Iterable[Part]) -> Iterator[Array]:
+def columns_of_parts(
+    v: Array, parts: Iterable[Part], rest: float | None = None
+) -> Iterator[Array]:
     """
     Give what each part of H makes of a normalised input; shapes (n,).
 
-    Lags along the path begin as `Hysteresis.settled` at the first input.
+    Lags along the path begin as `Hysteresis.settled` at `rest`, at the first input when absent.
 
     Examples
     --------
@@ -86,16 +88,17 @@ def columns_of_parts(v: Array, parts: Iterable[Part]) -> Iterator[Array]:
             yield from out[: len(group)]
         elif is_single_play(h):
             # a play runs faster by itself
-            for one, start in group:
-                yield one.weights[0] * play_columns(x, one.thresholds, start)[0]
+            for one, before in group:
+                yield one.weights[0] * play_columns(x, one.thresholds, before)[0]
         elif _is_lags_alone(h):
             rows = [row for one, _ in group for row in one.relaxations]  # type: ignore[union-attr]
             whole = replace(h, relaxations=np.array(rows))
             out = np.empty((len(rows), x.size))
-            _lags_apart(x, np.array(whole.relaxations), whole.settled(float(x[0])), out)
+            start = whole.settled(float(x[0]) if rest is None else rest)
+            _lags_apart(x, np.array(whole.relaxations), start, out)
             yield from out
         else:
-            yield from (one(x, start) for one, start in group)
+            yield from (one(x, before) for one, before in group)
 
 
 def _kind(part: Part) -> tuple[object, ...]:
@@ -115,7 +118,8 @@ def four_sums(low: float, q: Array, c: Array, memory: Array) -> tuple[float, flo
     """
     Return ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
 
-    psi is `piezo_ident.operators.kernels.curve`; q and c are those of `weights_of`.
+    psi is `piezo_ident.operators.kernels.curve`; q and c are those of `weights_of`.  Kernels of
+    other files hold it as it was when their own file changed last.
     """
     # written out, so that the loop over plays runs in vector lanes
     s_0, s_1, s_2, s_3 = 0.0, 0.0, 0.0, 0.0

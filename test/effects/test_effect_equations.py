@@ -196,6 +196,14 @@ def test_rate_dependence_of_parts_of_h_adds_up(name):
     found = np.array(list(operator.of_parts(block, u[0], parts)))
     again = ((part, start[own]) for part, own in law.parts(range(law.size)))
     assert_allclose(found, list(Effect.of_parts(operator, block, u[0], again)), atol=1e-12)
+    # a link in front of H may rest elsewhere than its first output
+    rest = u[0] + 0.05
+    held = [
+        (part, np.clip(start[own], rest - part.thresholds, rest))
+        for part, own in law.parts(range(law.size))
+    ]
+    alone = list(Effect.of_parts(operator, block, rest, held))
+    assert_allclose(list(operator.of_parts(block, rest, held)), alone, atol=1e-12)
     assert_allclose(theta @ found, operator.process(block).x, atol=1e-12)
     assert np.abs(theta @ found - h(u, start)).max() > 1e-3
 
