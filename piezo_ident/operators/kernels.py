@@ -126,6 +126,16 @@ def path_lines(x: Array) -> Array:
     return lines
 
 
+@ordered_kernel
+def lag_after(
+    z: float, c0: float, c1: float, c2: float, d3: float, last: float, u: float, left: float
+) -> float:
+    """Return a lag after the voltage went to u, of whose distance to its line a share is left."""
+    new = c0 + u * (c1 + u * (c2 + u * d3))
+    old = c0 + last * (c1 + last * (c2 + last * d3))
+    return new + (z - old) * left
+
+
 @kernel
 def relaxing(v: Array, x: Array, state: Array, out: Array) -> None:
     """
@@ -150,9 +160,7 @@ def relaxing(v: Array, x: Array, state: Array, out: Array) -> None:
                 left = left * left if a == 2.0 * before else np.exp(-a * length)
                 before = a
                 c0, c1, c2 = line[0, j], line[1, j], line[2, j]
-                new = c0 + u * (c1 + u * (c2 + u * d3))
-                old = c0 + last * (c1 + last * (c2 + last * d3))
-                state[j] = new + (state[j] - old) * left
+                state[j] = lag_after(state[j], c0, c1, c2, d3, last, u, left)
             total += state[j] - u * (d1 + u * (d2 + u * d3))
         last = u
         out[k] += total

@@ -19,7 +19,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel, ordered_kernel, part_of_kernels
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.kernels import held, path_lines
+from piezo_ident.operators.kernels import held, lag_after, path_lines
 from piezo_ident.operators.play import play_columns
 
 #: parts that run side by side
@@ -160,9 +160,7 @@ def _lags_apart(v: Array, x: Array, state: Array, out: Array) -> None:
             d1, d2, d3 = x[j, 1], x[j, 2], x[j, 3]
             if length > 0.0:
                 c0, c1, c2 = line[0, j], line[1, j], line[2, j]
-                new = c0 + u * (c1 + u * (c2 + u * d3))
-                old = c0 + last * (c1 + last * (c2 + last * d3))
-                state[j] = new + (state[j] - old) * left
+                state[j] = lag_after(state[j], c0, c1, c2, d3, last, u, left)
             out[j, k] = state[j] - u * (d1 + u * (d2 + u * d3))
         last = u
     state[n] = last
