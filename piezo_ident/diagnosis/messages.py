@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import LEAST_GAIN, TUNED
+from piezo_ident.diagnosis.criteria import LEAST_GAIN, SMALLEST_EFFECT, TUNED
 from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.rows import Rows
@@ -162,6 +162,12 @@ def sentence(
     names = ' and '.join(name.replace('_', ' ') for name in findings.effects)
     was, explains = ('was', 'explains') if len(findings.effects) == 1 else ('were', 'explain')
     tail = '' if is_given else f'; after a refit of the hysteresis {fall}'
+    gains = before > np.hypot(refit, SMALLEST_EFFECT)
+    if is_given and gains and not findings.keeps_given:
+        tail = (
+            f'; a refit of the hysteresis lowers the error from {before:.3g} to {refit:.3g} % of '
+            'stroke here, and need not hold elsewhere, so the model stays as given'
+        )
     if findings.verdict == 'named':
         text = f'{names} {explains} {share}; {fall}.'
     elif findings.verdict == 'class':

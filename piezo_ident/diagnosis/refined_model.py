@@ -68,7 +68,9 @@ def refine(
     metres = shifts * model.scaling.Y
     stays = findings.keeps_given or findings.may_follow_time
     if not (stays or findings.effects):
-        stays = not _is_worth(rows, fitted, e, noise)
+        # no motion held out speaks for a refit where nothing is missing
+        stays = findings.verdict == 'none' and not rows.kinds
+        stays = stays or not _is_worth(rows, fitted, e, noise)
         stays = stays or _harms_the_whole(simulator, given, fitted.state)
     if stays:
         return Refined(model, given, metres, is_given=True)
