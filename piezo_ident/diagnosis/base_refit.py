@@ -17,12 +17,12 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds
-from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected
+from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted, is_better
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
-from piezo_ident.diagnosis.search import gains_of
+from piezo_ident.diagnosis.search import gains_of, Selected
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import loops

@@ -17,9 +17,9 @@ import numpy as np
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.base_refit import refit_of, with_refit
 from piezo_ident.diagnosis.cross_validation import fitted_gain
-from piezo_ident.diagnosis.forward_selection import ForwardSelection, Selected, TESTED, WIDE_LAW
+from piezo_ident.diagnosis.forward_selection import ForwardSelection, TESTED, WIDE_LAW
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.search import gains_of, takes
+from piezo_ident.diagnosis.search import gains_of, Selected, takes
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import toward_given

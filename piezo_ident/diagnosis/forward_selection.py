@@ -13,7 +13,7 @@ what that explains.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria
@@ -22,7 +22,7 @@ from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
 from piezo_ident.diagnosis.polishing import polished, without_needless
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.retuning import RETUNING
-from piezo_ident.diagnosis.search import Round, search_round, stands_out, takes
+from piezo_ident.diagnosis.search import Round, search_round, Selected, stands_out, takes
 from piezo_ident.diagnosis.signature import has_place
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.trial_scores import best_trials
@@ -33,37 +33,6 @@ from piezo_ident.identification.results import Progress
 TESTED = ('periodic_disturbance', 'cross_coupling')
 #: weights that change with the bias are but another wide law of H
 WIDE_LAW = 'noncongruent_minor_loops'
-
-
-@dataclass(frozen=True, eq=False)
-class Selected:
-    """
-    Result of a forward selection.
-
-    Attributes
-    ----------
-    rounds, taken : tuple of Round
-        All, and those whose best contender was added.
-    fitted : Fitted
-        The fit at the end.
-    bent : Round or None
-        What an effect that bent G would leave, where a linear change was preferred.
-    left_out : frozenset of str
-        Effects that were not tried.
-    imitated : Round or None
-        Effects that follow the path of the command alone, beside plays.
-    linear : tuple of str
-        What goes with the speed, best first, and does half of what a retuned G does, where that
-        does the larger part and no effect fits its law.
-    """
-
-    rounds: tuple[Round, ...]
-    taken: tuple[Round, ...]
-    fitted: Fitted
-    bent: Round | None
-    left_out: frozenset[str]
-    imitated: Round | None = None
-    linear: tuple[str, ...] = ()
 
 
 class ForwardSelection:
@@ -326,8 +295,14 @@ class ForwardSelection:
         return self._beyond_noise(this.contenders[0] if this.contenders else this.before)
 
     def _round(
-        self, fitted: Fitted, effects: Sequence[type[Effect]] | None = None, **shares: float
+        self,
+        fitted: Fitted,
+        effects: Sequence[type[Effect]] | None = None,
+        *,
+        promise: float = criteria.WORTH_FIT,
+        worth: float = criteria.LEAST_GAIN,
     ) -> Round:
+        """Return a round over some effects, or all that are allowed; see `search_round`."""
         have = self._have | {added.name for added in fitted.state.effects}
         chosen = self._allowed if effects is None else effects
         candidates = [effect for effect in chosen if effect.name not in have]
@@ -337,8 +312,17 @@ class ForwardSelection:
             # most searches end after two or three rounds: the bar nears its end ever slower
             self._progress('candidates', 1.0 - 0.4 ** (done + share))
 
-        sim, lines, noise, rng = self._simulator, self._lines, self._noise, self._rng
-        return search_round(sim, fitted, candidates, lines, noise, rng, tick, **shares)
+        return search_round(
+            self._simulator,
+            fitted,
+            candidates,
+            self._lines,
+            self._noise,
+            self._rng,
+            tick,
+            promise=promise,
+            worth=worth,
+        )
 
     def _from(
         self, start: Fitted, first: Round, shown: Sequence[Round], bent: Round | None = None
@@ -363,9 +347,8 @@ class ForwardSelection:
             if len(taken) == self._most or self._beyond_noise(fitted) < smallest:
                 break
             is_further = len(taken) > len(shown)
-            this = self._round(
-                fitted, promise=criteria.LEAST_GAIN if is_further else criteria.WORTH_FIT
-            )
+            promise = criteria.LEAST_GAIN if is_further else criteria.WORTH_FIT
+            this = self._round(fitted, promise=promise)
             rounds.append(this)
         if len(fitted.state.effects) > 1:
             # of the others the rounds have asked whether they are needed, of the last one not yet

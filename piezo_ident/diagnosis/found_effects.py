@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 from piezo_ident.diagnosis.cross_validation import normal_equations, summed
-from piezo_ident.diagnosis.forward_selection import Selected
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FoundEffect, FoundParameter
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.search import Selected
 
 
 def found_effects(

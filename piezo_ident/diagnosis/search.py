@@ -68,6 +68,37 @@ class Round:
         return self.before.mean_square - self.contenders[0].mean_square
 
 
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """
+    Result of a forward selection.
+
+    Attributes
+    ----------
+    rounds, taken : tuple of Round
+        All, and those whose best contender was added.
+    fitted : Fitted
+        The fit at the end.
+    bent : Round or None
+        What an effect that bent G would leave, where a linear change was preferred.
+    left_out : frozenset of str
+        Effects that were not tried.
+    imitated : Round or None
+        Effects that follow the path of the command alone, beside plays.
+    linear : tuple of str
+        What goes with the speed, best first, and does half of what a retuned G does, where that
+        does the larger part and no effect fits its law.
+    """
+
+    rounds: tuple[Round, ...]
+    taken: tuple[Round, ...]
+    fitted: Fitted
+    bent: Round | None
+    left_out: frozenset[str]
+    imitated: Round | None = None
+    linear: tuple[str, ...] = ()
+
+
 def search_round(
     simulator: Simulator,
     before: Fitted,
@@ -77,8 +108,8 @@ def search_round(
     rng: np.random.Generator,
     tick: Tick,
     *,
-    promise: float = criteria.WORTH_FIT,
-    worth: float = criteria.LEAST_GAIN,
+    promise: float,
+    worth: float,
 ) -> Round:
     """
     Score all candidates and fit the best of them jointly.

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import standard_errors
-from piezo_ident.diagnosis.forward_selection import Selected
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.next_experiment import CONTAINS, look_alikes, separating_experiment
 from piezo_ident.diagnosis.results import (
@@ -33,7 +32,7 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import gains_of, Round
+from piezo_ident.diagnosis.search import gains_of, Round, Selected
 from piezo_ident.effects import catalogue, find_effect
 
 

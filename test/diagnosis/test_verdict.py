@@ -12,7 +12,7 @@ from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors,
 from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
 from piezo_ident.diagnosis.results import Class, DiagnosisSettings, Errors, Unexplained
-from piezo_ident.diagnosis.search import stands_out, takes
+from piezo_ident.diagnosis.search import Selected, stands_out, takes
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, rivals_of
 from piezo_ident.effects import catalogue, find_effect
@@ -315,7 +315,7 @@ def test_what_the_h_of_the_model_or_a_wide_one_does_not_leave_needs_no_effect(
     )
     search._round = lambda fitted: a_round(best)
     monkeypatch.setattr(forward_selection, 'without_needless', lambda s, fitted, *_: (fitted, []))
-    none = forward_selection.Selected((), (), wide, None, frozenset())
+    none = Selected((), (), wide, None, frozenset())
     found = search.beside(plays, wide, as_given, none)
     assert bool(found.taken) == is_taken
     assert found.fitted is (best if is_taken else wide)
@@ -534,7 +534,7 @@ def choose(rows):
         def selected(start, first, shown, bent=None):
             takes = fits and search._takes(first, first.before.mean_square, first=True)
             taken = (first,) if takes else ()
-            return forward_selection.Selected((first,), taken, start, bent, frozenset())
+            return Selected((first,), taken, start, bent, frozenset())
 
         search._from = selected
         found = search.run(starts['as it is'])
