@@ -126,6 +126,10 @@ CLASS_SIZE = 3
 #: a change of the dynamics that exceeds what the model missed of fast motion less than so many
 #: times has to fit its law
 NEWS = 2.0
+#: share of what G missed when it was identified, times the fast motion now over that of then, that
+#: a change must exceed: of simulated stages six names of changes that were none were below, and so
+#: were three changes of 46
+IN_PROPORTION = 0.5
 #: share from which a linear change is a finding of its own, not a side effect on G
 LINEAR = 0.5
 #: share of what a linear change leaves that a bent G and another effect must not exceed

@@ -14,7 +14,7 @@ From a model and measured data to the effect that the model lacks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.found_effects import found_effects
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.known_error import missed_now, missed_then
 from piezo_ident.diagnosis.messages import (
     left_over,
     part_judged,
@@ -224,7 +225,8 @@ def _diagnosed(
     # another axis makes lines, too: what its model leaves is hum
     shown = ['cross_coupling'] * any(test.significant for test in channels)
     shown += [HUM] * bool(frequencies)
-    missed, misfit = _missed(model), rows.percent(plays.mean_square - wide.mean_square)
+    misfit = rows.percent(plays.mean_square - wide.mean_square)
+    misses = missed_now(simulator)
     # what a wider law adds, and what a refit takes or loses: H fits no better than that
     doubt = max(misfit, rows.percent(abs(left - plays.mean_square)))
     search = ForwardSelection(
@@ -235,7 +237,8 @@ def _diagnosed(
         progress,
         certain=shown,
         smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * doubt),
-        missed=missed,
+        missed=missed_then(model),
+        misses=misses,
         misfit=misfit,
         given=left,
     )
@@ -271,7 +274,7 @@ def _diagnosed(
     tested = {HUM} if lines.searched else set()
     tested |= {'cross_coupling'} if any(test.tells for test in channels) else set()
     tested |= {*settings.without, *(setting.name for setting in model.effects)}
-    aside = set_aside(rows, selected, settings, noise, missed, tested)
+    aside = set_aside(rows, selected, settings, noise, misses, tested)
     explainable = max(base.mean_square - noise, 1e-300)
     bent = (base.mean_square - selected.rounds[0].before.mean_square) / explainable
     crept = rows.percent(float(np.max(simulator.crept(refined.state) ** 2)))
@@ -307,16 +310,6 @@ def _diagnosed(
         kinds=rows.kinds,
         is_of_refit=findings.of_refit > 0.0,
     )
-
-
-def _missed(model: StageModel) -> float:
-    """Return what the model missed at its identification, % of stroke, or 0: of fast motion."""
-    errors = model.identification.get('errors')
-    known = errors if isinstance(errors, Mapping) else {}
-    if 'fast_motion' in known:
-        known = {'fast_motion': known['fast_motion']}
-    # a file without that tells the error of all motion at least
-    return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:

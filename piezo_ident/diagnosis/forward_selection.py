@@ -41,8 +41,9 @@ class ForwardSelection:
 
     `certain` are effects that a test of their own has shown, whatever they explain of the rest;
     `smallest` is the rms of the smallest other effect that is taken, `missed` what the model
-    missed of fast motion when it was identified, % of stroke: no change of the dynamics since is
-    smaller; and `misfit` what a wider H takes, % of stroke.
+    missed of fast motion when it was identified, and `misses` what it may miss of these data, % of
+    stroke: no change of the dynamics since is smaller; and `misfit` what a wider H takes, % of
+    stroke.
     `given` is the mean square that the model leaves as it was given: where a refit of H leaves
     more, an effect has to gain against that.
     """
@@ -58,12 +59,14 @@ class ForwardSelection:
         certain: Sequence[str],
         smallest: float,
         missed: float,
+        misses: float,
         misfit: float,
         given: float,
     ) -> None:
         self._simulator = simulator
         self._lines, self._noise, self._certain, self._given = lines, noise, certain, given
         self._smallest, self._missed, self._misfit = smallest, missed, misfit
+        self._misses = misses
         #: rms of the least change of G that is a finding though no law fits [% of stroke]
         clear = max(criteria.CHANGE_FINDING, criteria.CLEAR_CHANGE * missed)
         self._change = min(criteria.REFIT_FINDING, clear)
@@ -92,7 +95,7 @@ class ForwardSelection:
             # behind a G nothing follows the path of the command alone: no H bends or holds a ring
             if (not effect.rate_independent or (effect.slot == 'output' and has_dynamics))
             and effect.name not in TESTED
-            and not (effect.in_dynamics and size < self._missed)
+            and not (effect.in_dynamics and size < self._misses)
         ]
         self._base, self._is_new = base, size >= criteria.NEWS * self._missed
         shown, retuned = self._of_tests(self.retuned(base))

@@ -293,13 +293,13 @@ def set_aside(
     selected: Selected,
     settings: DiagnosisSettings,
     noise: float,
-    missed: float,
+    misses: float,
     tested: Collection[str],
 ) -> dict[str, str]:
     """
     Return the candidates that were not tried though data might show them, and why not.
 
-    `missed` is what the model missed of fast motion when it was identified, % of stroke.
+    `misses` is what G may miss of these data, % of stroke.
     """
     tried = _visible(selected.rounds)
     size = rows.percent(selected.rounds[0].before.mean_square - noise)
@@ -308,10 +308,10 @@ def set_aside(
         effect = find_effect(name)
         if name in tried or name in tested:
             continue
-        if effect.in_dynamics and size < missed:
+        if effect.in_dynamics and size < misses:
             found[name] = (
-                f'only {size:.2g} % of stroke are left for it; the model missed {missed:.2g} % '
-                'of fast motion when it was identified'
+                f'only {size:.2g} % of stroke are left for it; of motion as fast as here G may '
+                f'miss {misses:.2g} %, by what it missed when it was identified'
             )
         elif effect.rate_independent and selected.imitated is None:
             found[name] = 'a sum of plays leaves nothing for it'

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,9 +115,11 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
     return residual_noise_floor(parts, all_stretches(parts))
 
 
-def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> float:
+def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float, float]:
     """
-    Return what G and the delay leave of all fast motion beside a fine H, % of stroke.
+    Return what G and the delay leave of all fast motion beside a fine H, and all of it.
+
+    Both rms, in % of stroke.
 
     A few plays miss small loops, and fast motion with them; a diagnosis fits a fine H of its own.
     A zero that moved and what creeps are no part of it.
@@ -130,12 +132,16 @@ def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> float:
         model = replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
     predictions = predictions_of(model, runs)
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
-    errors = [
-        high_passed(p.run.piece.y - p.y_hat, p.run.piece.sample_rate)[p.run.use]
-        / stroke_of[p.run.record]
-        for p in predictions
-    ]
-    return 100.0 * float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+    def fast_rms(signals: Iterable[Array]) -> float:
+        parts = [
+            high_passed(y, p.run.piece.sample_rate)[p.run.use] / stroke_of[p.run.record]
+            for y, p in zip(signals, predictions, strict=True)
+        ]
+        return 100.0 * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+    left = (p.run.piece.y - p.y_hat for p in predictions)
+    return fast_rms(left), fast_rms(p.run.piece.y for p in predictions)
 
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:

@@ -354,11 +354,10 @@ def first_steps(
     return replace(steps, delay=delay, dynamics=found)
 
 
-def _provenance(result: Identification, names: list[str], fast: float) -> dict[str, Any]:
+def _provenance(result: Identification, names: list[str], fast: Sequence[float]) -> dict[str, Any]:
     """Return what the model file says about its origin."""
     fit, dynamics = result.hysteresis, result.dynamics
-    m = fit.hysteresis.thresholds.size
-    na = dynamics.order[0]
+    m, na = fit.hysteresis.thresholds.size, dynamics.order[0]
     sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))
     return {
         'method': 'three steps' if dynamics.table is not None else 'joint free-run fit',
@@ -383,7 +382,7 @@ def _provenance(result: Identification, names: list[str], fast: float) -> dict[s
                 for data in ('fitted', 'selection', 'held out', 'validation')
                 if np.isfinite(result.error(data))
             },
-            'fast_motion': fast,
+            'fast_motion': fast[0],
             'worst': max((row.percent for row in result.errors if row.driven), default=np.nan),
         },
         'uncertainties': {
@@ -394,6 +393,7 @@ def _provenance(result: Identification, names: list[str], fast: float) -> dict[s
             'a': sigma[:na].tolist(),
             'b': sigma[na : na + dynamics.order[1]].tolist(),
         },
+        'fast_displacement': {'percent_of_stroke': fast[1]},
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
         'warnings': list(result.warnings),
         'not_identified': [f'{what}: {why}' for what, why in result.not_identified],

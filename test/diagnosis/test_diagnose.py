@@ -743,22 +743,6 @@ def test_left_out_blocks_are_predicted_as_by_a_fit_without_them():
     assert errors[rows.fold == 2].sum() == pytest.approx(left @ left, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ('errors', 'missed'),
-    [
-        ({'unit': '%', 'fitted': 0.1, 'selection': 0.2, 'fast_motion': 0.05}, 0.05),
-        ({'fitted': 0.1, 'selection': 0.2, 'held_out': 0.3, 'fast_motion': 0.05}, 0.05),
-        # of records without labels
-        ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2, 'fast_motion': 0.05}, 0.05),
-        # an older file
-        ({'unit': '%', 'fitted': 0.1, 'held_out': 0.2}, 0.2),
-        (None, 0.0),
-    ],
-)
-def test_what_a_model_missed_is_read_from_its_file(errors, missed):
-    assert diagnose_module._missed(SimpleNamespace(identification={'errors': errors})) == missed
-
-
 def test_a_limit_that_one_kind_of_excitation_reaches_is_kept():
     model, record, unseen = measured('slew_limit', 0.3, 2)
     few = DiagnosisSettings(effects=('slew_limit', 'amplifier_lag', 'changed_dynamics'))

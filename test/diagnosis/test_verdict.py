@@ -138,6 +138,7 @@ def test_a_change_of_a_g_that_was_known_well_is_found_sooner(rows, missed, least
         certain=(),
         smallest=0.05,
         missed=missed,
+        misses=missed,
         misfit=0.0,
         given=1.0,
     )
@@ -515,7 +516,8 @@ def choose(rows):
 
     def chosen(linear, bent, fits=True, retuned_left=0.05, passes=9.0, **changed):
         rows.passes = passes
-        search = a_search(rows, **{'_missed': 0.0, '_certain': (), '_misfit': 0.0} | changed)
+        known = {'_missed': 0.0, '_misses': 0.0, '_certain': (), '_misfit': 0.0}
+        search = a_search(rows, **known | changed)
         search._simulator.model = SimpleNamespace(dynamics=SimpleNamespace(a=np.ones(2)))
         names = ('amplifier_lag', 'changed_dynamics', 'sensor_nonlinearity', 'saturation')
         search._candidates = [find_effect(n) for n in names]

@@ -24,7 +24,8 @@ def record():
 
 
 def missed(model, record, law='plays'):
-    return fast_error(model, law, runs_of([record], MODEL.sample_rate, MODEL.scaling))
+    left, _ = fast_error(model, law, runs_of([record], MODEL.sample_rate, MODEL.scaling))
+    return left
 
 
 def test_a_coarse_h_is_not_held_against_g(record):
@@ -44,3 +45,13 @@ def test_slow_errors_do_not_count_and_a_wrong_delay_does(record):
     assert missed(MODEL, creeping) < 0.05
     late = replace(MODEL, delay=Delay(MODEL.delay.samples + 1))
     assert missed(late, record) > 10 * missed(MODEL, record)
+
+
+def test_all_fast_motion_is_that_of_the_displacement(record):
+    _, fast = fast_error(MODEL, 'preisach', runs_of([record], MODEL.sample_rate, MODEL.scaling))
+    (piece,) = record.pieces
+    spectrum = np.abs(np.fft.rfft(piece.y - piece.y.mean())) ** 2
+    above = np.fft.rfftfreq(piece.n, 1.0 / piece.sample_rate) > 30.0
+    rms = np.sqrt(2.0 * spectrum[above].sum()) / piece.n
+    # the filter is no brick wall
+    assert fast == pytest.approx(100.0 * rms / np.ptp(piece.y), rel=0.1)

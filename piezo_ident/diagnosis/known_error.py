@@ -1,0 +1,46 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What G missed when it was identified: no smaller change of the dynamics can be told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.identification.fast_motion import high_passed
+from piezo_ident.model.stage_model import StageModel
+
+
+def missed_then(model: StageModel) -> float:
+    """Return what the model missed at its identification, % of stroke, or 0: of fast motion."""
+    known = _entries(model, 'errors')
+    if 'fast_motion' in known:
+        known = {'fast_motion': known['fast_motion']}
+    # a file without that tells the error of all motion at least
+    return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
+
+
+def missed_now(simulator: Simulator) -> float:
+    """
+    Return what G may miss of the motion in these data, % of stroke.
+
+    What it misses grows with the motion.  Part of what it missed then is none of G, such as small
+    loops that open less than H says, so only a share counts of what the proportion gives.
+    """
+    model = simulator.model
+    then = _entries(model, 'fast_displacement').get('percent_of_stroke')
+    missed = missed_then(model)
+    if not isinstance(then, int | float) or not then > 0.0:
+        return missed
+    fast = [high_passed(run.x, run.piece.sample_rate)[run.use] for run in simulator.rows.runs]
+    now = 100.0 * float(np.sqrt(np.mean(np.concatenate(fast) ** 2)))
+    return missed * max(1.0, criteria.IN_PROPORTION * now / float(then))
+
+
+def _entries(model: StageModel, name: str) -> Mapping[str, Any]:
+    found = model.identification.get(name)
+    return found if isinstance(found, Mapping) else {}
