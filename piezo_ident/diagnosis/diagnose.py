@@ -281,7 +281,9 @@ def _diagnosed(
     progress('verdict', 1.0)
     return Diagnosis(
         verdict=findings.verdict,
-        sentence=sentence(findings, (before, refit, after), rest, smallest, refined.is_given),
+        sentence=sentence(
+            findings, (before, refit, after), rest, smallest, refined.is_given, bent
+        ),
         given=model,
         model=refined.model,
         effects=found_effects(rows, found.before, selected, found.explainable, last),

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import LEAST_GAIN, SMALLEST_EFFECT, TUNED
-from piezo_ident.diagnosis.refined_model import lasting, Refined, WANDERS
+from piezo_ident.diagnosis.criteria import LEAST_GAIN, LINEAR, SMALLEST_EFFECT, TUNED
+from piezo_ident.diagnosis.refined_model import Refined, WANDERS
 from piezo_ident.diagnosis.results import Class, Errors, Unexplained
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.state import Added
@@ -84,7 +84,8 @@ def warnings_of(
     if not refined.is_given and np.any(np.abs(state.retuning) > TUNED):
         why = (
             f', and {100.0 * bent:.0f} % of what a refit of the hysteresis leaves goes with that '
-            'alone: an effect bent them at the identification, or they have changed since'
+            'alone: they were off at the identification, by an effect or for lack of fast motion, '
+            'or they have changed since'
         )
         found.append(
             'the dynamics were retuned in the band that the data drive'
@@ -96,9 +97,8 @@ def warnings_of(
             'stroke; this was fitted and is no part of any error. A free run of such a record '
             'estimates it from the early part; from the voltage alone nothing tells it'
         )
-    stay = bool(lasting(findings.effects))
     found += [
-        _of_time_driven(a, refined.h_is_given, stay) for a in state.effects if a.effect.time_driven
+        _of_time_driven(a, refined.h_is_given) for a in state.effects if a.effect.time_driven
     ]
     for shift in refined.shifts[refined.shifts != 0.0]:
         found.append(
@@ -116,15 +116,14 @@ def warnings_of(
     return found
 
 
-def _of_time_driven(added: Added, h_is_given: bool, beside_others: bool) -> str:
+def _of_time_driven(added: Added, h_is_given: bool) -> str:
     effect = added.effect
     is_off = all(effect.is_neutral(effect.elsewhere(values)) for values in added.values)
-    # a refitted H was fitted to the mean of what wanders
-    kept = 'it switched off' if h_is_given or is_off else 'its mean'
-    if beside_others and added.name == WANDERS:
+    kept = 'it switched off' if is_off else 'its mean'
+    if added.name == WANDERS:
         kept = 'the gain of the given one'
     if h_is_given:
-        kept += ', and the hysteresis as it was given'
+        kept = 'it switched off, and the hysteresis as it was given'
     return (
         f'{added.name} follows time and not the voltage: what was found holds in its own '
         f'record alone, so the refined model carries {kept}'
@@ -137,12 +136,14 @@ def sentence(
     rest: Unexplained,
     smallest: float | None,
     is_given: bool,
+    bent: float,
 ) -> str:
     """
     Return the verdict as a sentence.
 
     The errors are before, with the base refitted, and after; `smallest` is the smallest detectable
-    effect [% of stroke], and `is_given` says whether the model stays as it was given.
+    effect [% of stroke], `is_given` says whether the model stays as it was given, and `bent` is
+    as in `warnings_of`.
     """
     before, refit, after = (e.overall for e in errors)
     fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
@@ -182,6 +183,11 @@ def sentence(
             text += f' Whether it is {_or(findings.group)}, these data do not tell.'
     elif findings.verdict == 'refitted':
         text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}.'
+        if bent >= LINEAR:
+            text = (
+                'the hysteresis and the dynamics of the model are not those of these data: '
+                f'refitted, with no effect added, {fall}.'
+            )
         if is_given:
             text = (
                 'the hysteresis of the model is not that of these data: a refit lowers the error '

@@ -80,7 +80,7 @@ def rivals(rows, *contenders, plays=True):
 def test_a_refit_that_is_not_kept_is_said():
     errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.2, 0.4))
     findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
-    said = sentence(findings, errors, rest, 0.05, True)
+    said = sentence(findings, errors, rest, 0.05, True, 0.0)
     assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
 
 
@@ -88,12 +88,12 @@ def test_what_scatters_beyond_the_limit_is_not_called_smaller():
     errors = tuple(Errors(0.15, {}, {}) for _ in range(3))
     findings = Findings('none', 0.0, (), None, 0.07)
     rest = findings.unexplained(left_over(findings, 0.05, 9.0))
-    said = sentence(findings, errors, rest, 0.05, True)
+    said = sentence(findings, errors, rest, 0.05, True, 0.0)
     assert '0.07 % of stroke that are left differ from one part' in said
     assert 'no effect is claimed' in rest.description
     small = replace(findings, left=0.03)
     rest = small.unexplained(left_over(small, 0.05, 9.0))
-    assert 'the smallest would be 0.05 %' in sentence(small, errors, rest, 0.05, True)
+    assert 'the smallest would be 0.05 %' in sentence(small, errors, rest, 0.05, True, 0.0)
 
 
 def test_how_much_was_judged_is_said():
@@ -107,7 +107,7 @@ def test_how_much_was_judged_is_said():
 def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
     errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.4, 0.4))
     found, rest = Findings('named', 0.95, ('creep',), None, 0.1), Unexplained(0.05, 0.1, 'rest')
-    said = sentence(found, errors, rest, 0.05, True)
+    said = sentence(found, errors, rest, 0.05, True, 0.0)
     assert said.endswith(
         'other motion gains too little: the model stays as given (0.4 % of stroke).'
     )
@@ -118,7 +118,7 @@ def test_what_may_follow_time_alone_leaves_the_model_as_given():
     group = Class(('creep', 'gain_drift'), 'record that')
     found = Findings('partly_explained', 0.7, ('creep',), group, 0.1)
     assert found.may_follow_time
-    said = sentence(found, errors, Unexplained(0.3, 0.1, 'rest'), 0.05, True)
+    said = sentence(found, errors, Unexplained(0.3, 0.1, 'rest'), 0.05, True, 0.0)
     assert 'another record may know nothing of that: the model stays as given (0.4 %' in said
     others = Class(('creep', 'rate_dependent_hysteresis'), 'record that')
     assert not replace(found, group=others).may_follow_time
@@ -264,7 +264,7 @@ def test_what_explains_a_part_may_be_a_class_too(rows):
     assert found.verdict == 'partly_explained' and found.effects == ('creep',)
     assert found.group.names == ('creep', 'thermal_drift')
     errors = tuple(Errors(x, {}, {}) for x in (1.0, 1.0, 0.3))
-    said = sentence(found, errors, Unexplained(0.09, 0.3, 'rest'), 0.05, False)
+    said = sentence(found, errors, Unexplained(0.09, 0.3, 'rest'), 0.05, False, 0.0)
     assert said.endswith('Whether it is creep or thermal drift, these data do not tell.')
 
 
