@@ -88,15 +88,12 @@ def refine(
     if shifts.any():
         offsets = fitted.state.offsets - shifts
         fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
-    if not findings.effects or lasting(findings.effects):
+    lasts = not findings.effects or bool(lasting(findings.effects))
+    if lasts or _is_finding(simulator, given, fitted):
         state = _at_given_gain(simulator, given, fitted.state)
-        # what a gain makes of the next record, these do not tell
-        told = errors if state is fitted.state else errors[:1]
+        # what a gain or a drift makes of the next record, these do not tell
+        told = errors if lasts and state is fitted.state else errors[:1]
         refined = _model(simulator, state, findings, _range(simulator), told)
-        return Refined(refined, fitted.state, metres)
-    # what the model leaves out was there, and will be
-    if _is_finding(simulator, given, fitted):
-        refined = _model(simulator, fitted.state, findings, _range(simulator), errors[:1])
         return Refined(refined, fitted.state, metres)
     # H was refitted together with a drift that another record will not repeat
     effects = tuple(

@@ -449,6 +449,21 @@ def test_a_gain_that_has_changed_before_a_record_begins_is_given(offset):
     assert result.after.overall < 0.03 < 0.3 < result.before.overall
 
 
+def test_a_refit_beside_a_gain_that_wanders_has_the_given_gain():
+    model, bent = with_another_h(0.1)
+    (piece,) = bent.pieces
+    sinking = replace(piece, y=piece.y * np.linspace(1.0, 0.92, piece.n))
+    result = diagnose(
+        model, Record((sinking,), 'sinking'), DiagnosisSettings(effects=('gain_drift',))
+    )
+    assert [effect.name for effect in result.effects] == ['gain_drift']
+    given, refined = (m.simulate(piece.v) for m in (model, result.model))
+    given, refined = (y - y.mean() for y in (given, refined))
+    assert np.std(refined - given) > 0.005 * np.std(given)
+    assert refined @ given / (given @ given) == pytest.approx(1.0, abs=0.005)
+    assert any('carries the gain of the given one' in warning for warning in result.warnings)
+
+
 def test_a_gain_drifts_by_the_clock_that_the_model_has_already():
     model, record, _ = measured(None, 0.0, 2)
     (piece,) = record.pieces
