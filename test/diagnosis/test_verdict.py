@@ -84,6 +84,14 @@ def test_a_refit_that_is_not_kept_is_said():
     assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
 
 
+@pytest.mark.parametrize(('bent', 'what'), [(0.4, 'hysteresis of'), (0.6, 'dynamics of')])
+def test_what_was_refitted_is_said(bent, what):
+    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.2, 0.1))
+    findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
+    said = sentence(findings, errors, rest, 0.05, False, bent)
+    assert f'{what} the model' in said and 'falls from 0.4 to 0.1 %' in said
+
+
 def test_what_scatters_beyond_the_limit_is_not_called_smaller():
     errors = tuple(Errors(0.15, {}, {}) for _ in range(3))
     findings = Findings('none', 0.0, (), None, 0.07)
