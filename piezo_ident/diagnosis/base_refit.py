@@ -18,7 +18,14 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds
 from piezo_ident.diagnosis.forward_selection import ForwardSelection
-from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted, is_better
+from piezo_ident.diagnosis.joint_fit import (
+    base_at,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    is_better,
+    may_be_better,
+)
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
@@ -31,8 +38,6 @@ from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import catalogue, find_effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
-#: laws that are tried in the place of the widest, the narrowest first
-_NARROWER: tuple[LawName, ...] = ('plays', 'preisach')
 #: times the error of the given model that an H of records without kinds of motion may be off it
 LOOSE = 2.0
 
@@ -124,13 +129,18 @@ def _selected(
     # is no sign of one
     if found.taken and _is_loose(simulator, given, fitted):
         fitted = refit_of(simulator, fitted.state, 'preisach')
-    for narrower in _NARROWER:
-        is_known = narrower == 'plays' and bool(found.taken)
-        other = beside if is_known else refit_of(simulator, fitted.state, narrower)
-        if not is_better(fitted, other):
-            fitted = other
-            break
-    return wide, replace(both, fitted=fitted)
+    narrow = beside if found.taken else refit_of(simulator, fitted.state, 'plays')
+    return wide, replace(both, fitted=_narrowest(simulator, narrow, fitted))
+
+
+def _narrowest(simulator: Simulator, plays: Fitted, wide: Fitted) -> Fitted:
+    """Return the fit of the narrowest law that no wider one beats."""
+    if not may_be_better(wide, plays):
+        return plays
+    between = refit_of(simulator, wide.state, 'preisach')
+    if not any(is_better(wider, plays) for wider in (between, wide)):
+        return plays
+    return wide if is_better(wide, between) else between
 
 
 def with_refit(

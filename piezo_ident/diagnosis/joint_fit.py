@@ -238,11 +238,20 @@ def fit_jointly(
 
 def is_better(wide: Fitted, narrow: Fitted) -> bool:
     """Return whether a wider fit predicts clearly better, both held-out blocks and whole kinds."""
+    return _predicts(wide) < WIDER**2 * _predicts(narrow)
 
-    def square(fitted: Fitted) -> float:
-        return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
 
-    return square(wide) < WIDER**2 * square(narrow)
+def may_be_better(wide: Fitted, narrow: Fitted) -> bool:
+    """
+    Return whether a fit between the two may predict clearly better than the narrow one.
+
+    What was not fitted it predicts no better than the widest fits it.
+    """
+    return float(wide.e @ wide.e) < WIDER**2 * _predicts(narrow)
+
+
+def _predicts(fitted: Fitted) -> float:
+    return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
 
 
 def _to_come(gain: float, last: float, more: int) -> float:
