@@ -19,6 +19,8 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 #: effect that goes on when the motion has ended
 CREEP = 'creep'
+#: and the one that it looks like beside an H that is no sum of plays
+DRIFT = 'thermal_drift'
 
 
 @dataclass(frozen=True, eq=False)

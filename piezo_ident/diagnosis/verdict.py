@@ -33,6 +33,7 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import gains_of, Round, Selected
+from piezo_ident.diagnosis.state import CREEP, DRIFT
 from piezo_ident.effects import catalogue, find_effect
 
 
@@ -154,6 +155,10 @@ def _alike(
         like = selected.linear if contenders[0].name in selected.linear else ()
         like = (*changes, *like) if contenders[0].name in changes else like
         like = (*like, *known) if contenders[0].name in known else like
+        if contenders[0].name == CREEP and not plays:
+            # shares of creep over decades make up for what a drift leaves
+            share = gains_of(rows, this).get(DRIFT, 0.0) / (this.before.mean_square - rest)
+            like = (*like, DRIFT) if share > criteria.DRIFTS else like
         names = tuple(dict.fromkeys([*(c.name for c in (contenders[0], *rivals)), *like]))
         untried = [name for name in look_alikes(names[0]) if name in selected.left_out]
         if len(names) > 1 or untried:

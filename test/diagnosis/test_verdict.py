@@ -255,6 +255,28 @@ def test_what_creeps_on_from_before_is_held_against_a_rival_and_creep_alike(rows
     assert verdict(rows, [this], 0.001, fading=fading).verdict == said
 
 
+@pytest.mark.parametrize(
+    ('law', 'share_left', 'names'),
+    [
+        ('duhem', 0.25, ('creep', 'thermal_drift')),
+        ('duhem', 0.45, None),
+        # plays leave creep nothing to make up for
+        ('plays', 0.25, None),
+    ],
+)
+def test_creep_beside_a_wide_h_may_be_a_drift(rows, law, share_left, names):
+    this = a_round(contender('creep', 0.01))
+    drift = (WHOLE * share_left) * rows.n
+    this.best['thermal_drift'] = SimpleNamespace(error=drift)
+    last = fitted(0.01 * WHOLE)
+    last.state.law = SimpleNamespace(name=law)
+    selected = SimpleNamespace(
+        fitted=last, taken=[this], bent=None, left_out=frozenset(), linear=()
+    )
+    found = judge(rows, fitted(WHOLE), selected, 0.0)
+    assert (found.group and found.group.names) == names
+
+
 def test_two_changes_of_one_g_may_be_one(rows):
     first = a_round(contender('changed_dynamics', 0.1))
     second = a_round(contender('amplifier_lag', 0.001), before=0.1 * WHOLE)
