@@ -219,11 +219,12 @@ def test_standard_errors_pair_the_blocks():
 # -- the verdict -------------------------------------------------------------------------------
 
 
-def verdict(rows, taken, left, bent=None, fading=()):
+def verdict(rows, taken, left, bent=None, fading=(), law=None):
     selected = SimpleNamespace(
         fitted=fitted(left * WHOLE), taken=taken, bent=bent, left_out=frozenset(), linear=()
     )
     selected.fitted.state.fading = fading
+    selected.fitted.state.law = law
     return judge(rows, fitted(WHOLE), selected, 0.0)
 
 
@@ -266,14 +267,8 @@ def test_what_creeps_on_from_before_is_held_against_a_rival_and_creep_alike(rows
 )
 def test_creep_beside_a_wide_h_may_be_a_drift(rows, law, share_left, names):
     this = a_round(contender('creep', 0.01))
-    drift = (WHOLE * share_left) * rows.n
-    this.best['thermal_drift'] = SimpleNamespace(error=drift)
-    last = fitted(0.01 * WHOLE)
-    last.state.law = SimpleNamespace(name=law)
-    selected = SimpleNamespace(
-        fitted=last, taken=[this], bent=None, left_out=frozenset(), linear=()
-    )
-    found = judge(rows, fitted(WHOLE), selected, 0.0)
+    this.best['thermal_drift'] = SimpleNamespace(error=share_left * WHOLE * rows.n)
+    found = verdict(rows, [this], 0.01, law=SimpleNamespace(name=law))
     assert (found.group and found.group.names) == names
 
 
