@@ -151,15 +151,15 @@ not to its square; the damping of some modes rises. One linear model cannot have
 {periodicity}
 
 All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods. What fails the test
-is weighted down in the fit, without being told.
+is weighted down in the fit, without a hint.
 
 ## What is left
 
 Noise is {noise} % of rms(y) in one period at 100 / 200 / 300 mV. What lies between it and the
 errors above repeats from period to period, grows nearly in proportion to the amplitude, and is no
 candidate of this page: below 400 Hz and above 3 kHz, where nothing was driven, none of them lowers
-the error of a linear model. All lines up to 3 kHz are driven, so odd and even distortion cannot be
-told apart by line.
+the error of a linear model. All lines up to 3 kHz are driven, so lines do not tell odd
+distortion from even.
 """
 
 

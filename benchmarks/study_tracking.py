@@ -60,7 +60,7 @@ TEXT = """\
 
 `make track` made this page. Each stage is simulated by laws that the model does not have; its
 sensor has no noise, but the steps of its converter, up to 0.04 % here. It was identified from one
-record and diagnosed on another, with an effect in it that nobody declared; then it was told to
+record and diagnosed on another, with an effect in it that was not declared; then it had to
 follow {motions} motions.
 
 ![Tracking errors of each stage, four ways](images/tracking.png)
