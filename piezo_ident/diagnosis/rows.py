@@ -371,10 +371,13 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
     group = np.array([number.get(label, rest) for label in labels])
     if np.any(group == rest):
         names = [*names, REST]
-    if len(names) == 1:
-        # of one kind nothing would be left to predict it from: parts of it stand for kinds
+    few = all(PART in name for name in names) and len(names) < GROUPS // 2
+    if len(names) == 1 or few:
+        # of one kind, or where most of a record is not judged, nothing would be left to predict
+        # from: parts of what is judged stand for kinds
+        whole = ' and '.join(dict.fromkeys(name.partition(PART)[0] for name in names))
         group = np.arange(group.size) * GROUPS // group.size
-        names = [f'{names[0]}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
+        names = [f'{whole}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
     return group, tuple(names)
 
 

@@ -7,10 +7,12 @@ from dataclasses import replace
 from functools import cache
 from itertools import groupby
 
+from measured_data import measured_record
 import numpy as np
 from piezo_ident import DiagnosisSettings, Record, SimulatedStage
 from piezo_ident.diagnosis import conclusion, diagnose
 from piezo_ident.diagnosis.base_refit import refit_of
+from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
@@ -149,3 +151,15 @@ def test_without_labels_no_lags_are_fitted_beside_what_set_in_since(monkeypatch)
     result = diagnose(stage(), record(changed, labelled=False), few)
     assert [e.name for e in result.effects] == ['saturation'], result.sentence
     assert asked == ['preisach']
+
+
+def test_the_verdict_on_a_measured_stage_is_one_for_all_parts_of_it():
+    (piece,) = measured_record('piezo_1hz.csv').pieces
+    third = piece.n // 3
+    parts = [piece.cut(i * third, (i + 1) * third) for i in range(3)]
+    pairs = [Record((piece.cut(0, 2 * third),), 'first'), Record((parts[0], parts[2]), 'outer')]
+    pairs.append(Record((piece.cut(third, 3 * third),), 'last'))
+    # the model of the first loops, behind a long rest, errs by half a percent
+    model = identify(pairs[0]).model
+    found = [diagnose(model, pair) for pair in pairs]
+    assert [(one.verdict, one.effects) for one in found] == [('refitted', ())] * 3

@@ -39,3 +39,16 @@ def test_rows_count_once_the_voltage_has_swept_most_of_its_range():
     as_at_rest = replace(rows, memories=(lambda r: initial_memory(u0, r),))
     # the wide plays stand where they were found
     assert missed(rows) < 1e-6 < 0.005 < missed(as_at_rest)
+
+
+def test_parts_of_what_is_judged_stand_for_kinds_where_most_of_a_record_rests():
+    model = SimulatedStage.load('paper').model
+    t = np.arange(FS) / FS
+    # six seconds of rest in the middle of the range, of which the memory is not known
+    v = np.concatenate([np.full(6 * FS, 5.0), 5.0 + 5.0 * np.sin(4 * np.pi * t)])
+    y = model.simulate(np.concatenate([np.linspace(0, 8, FS), np.linspace(8, 5, FS), v]))
+    rows = make_rows(model, [Record.from_arrays(v, y[2 * FS :], sample_rate=FS, name='late')])
+    assert not rows.kinds
+    assert rows.labels == tuple(f'late, part {i + 1}' for i in range(8))
+    counts = np.bincount(rows.group[rows.block])
+    assert counts.min() > 0.8 * counts.max()

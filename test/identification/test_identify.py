@@ -5,12 +5,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-import os
 from pathlib import Path
 
+from measured_data import measured_record
 import numpy as np
 from numpy.testing import assert_array_equal
-import piezo_ident as pi
 from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import three_steps
@@ -32,7 +31,6 @@ import pytest
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get('PIEZO_IDENT_DATA', ROOT.parent / 'shared/data'))
 PAPER = SimulatedStage.load(ROOT / 'config/stage_paper.yaml')
 DENSE = SimulatedStage.load(ROOT / 'config/stage_dense.yaml')
 FULL = Program.load(ROOT / 'config/program_identification.yaml')
@@ -284,16 +282,9 @@ def test_progress_rises_to_one_in_every_step():
 # -- what a lab really hands over --------------------------------------------------------------
 
 
-def measured(name: str) -> Record:
-    path = DATA / name
-    if not path.is_file():
-        pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA to the folder of measured records')
-    return pi.read(path)
-
-
 @pytest.mark.parametrize(('settings', 'limit'), [({'thresholds': 10}, 0.30), ({}, 0.17)])
 def test_measured_one_hertz_record(settings, limit):
-    result = identify(measured('piezo_1hz.csv'), Settings(hold_out=1.5, **settings))
+    result = identify(measured_record('piezo_1hz.csv'), Settings(hold_out=1.5, **settings))
     (held,) = [row for row in result.errors if row.data == 'held out']
     modes = result.model.dynamics.modes(result.model.sample_rate)
     assert held.n == 7500
@@ -304,7 +295,7 @@ def test_measured_one_hertz_record(settings, limit):
 
 
 def test_in_the_end_an_unlabelled_record_is_fitted_whole():
-    record = measured('piezo_1hz.csv')
+    record = measured_record('piezo_1hz.csv')
     (piece,) = record.pieces
     n = round(6.0 * piece.sample_rate)
     result = identify(Record((piece.cut(0, n),), 'six seconds'))
@@ -317,18 +308,18 @@ def test_in_the_end_an_unlabelled_record_is_fitted_whole():
 
 def test_measured_closed_loop_is_refused():
     with pytest.raises(IdentificationError, match='position controller'):
-        identify(measured('afm_hold.csv'))
+        identify(measured_record('afm_hold.csv'))
 
 
 def test_measured_closed_loop_is_refused_by_its_ramps_alone():
-    record = measured('afm_hold.csv')
+    record = measured_record('afm_hold.csv')
     for piece in (record.pieces[1], record.pieces[3]):
         with pytest.raises(IdentificationError, match='straight line'):
             identify(Record((piece,), 'ramp'))
 
 
 def test_measured_open_loop_is_identified_with_a_warning():
-    result = identify(measured('afm_open_loop.csv'))
+    result = identify(measured_record('afm_open_loop.csv'))
     assert result.warnings
     assert result.model.dynamics.is_stable
     assert result.error('fitted') < 2.0

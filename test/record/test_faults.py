@@ -4,9 +4,8 @@
 """Data in which every number is in order, and something is wrong all the same."""
 
 from dataclasses import replace
-import os
-from pathlib import Path
 
+from measured_data import DATA
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import IdentificationError
@@ -91,9 +90,6 @@ def test_a_displacement_of_noise_is_refused():
 
 # --- readings that are none --------------------------------------------------------------------
 
-DATA = Path(
-    os.environ.get('PIEZO_IDENT_DATA', Path(__file__).resolve().parents[3] / 'shared/data')
-)
 RATE = 20_000.0
 T = np.arange(200_000) / RATE
 V = 5 + 5 * np.sin(2 * np.pi * T)

@@ -4,12 +4,12 @@
 """Every format keeps every bit, and bad files end in one line that names the cure."""
 
 import itertools
-import os
 from pathlib import Path
 import zipfile
 
 from hypothesis import given, HealthCheck, Phase, settings
 from hypothesis import strategies as st
+from measured_data import measured_record
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import DataError
@@ -17,9 +17,6 @@ from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 import scipy.io
 
-DATA = Path(
-    os.environ.get('PIEZO_IDENT_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data')
-)
 FORMATS = ('r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3', 'r_mcap', 'r_sqlite3')
 LABELS = st.sampled_from(['noise', 'sine:50Hz', 'hold:4V', 'a, "quoted" label', 'größer'])
 FINITE = st.floats(-10, 10, allow_nan=False)
@@ -437,10 +434,7 @@ def test_links_that_lead_nowhere(tmp_path, name):
     ],
 )
 def test_measured_files(tmp_path, name, rates, sizes):
-    path = DATA / name
-    if not path.is_file():
-        pytest.skip(f'{path} is not there; set PIEZO_IDENT_DATA')
-    measured = pi.read(path)
+    measured = measured_record(name)
     assert [p.sample_rate for p in measured] == rates
     assert [p.n for p in measured] == sizes
     assert {f.name for f in measured.faults} <= {'rate_change'}
