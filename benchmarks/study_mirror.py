@@ -151,7 +151,7 @@ not to its square; the damping of some modes rises. One linear model cannot have
 {periodicity}
 
 All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods. What fails the test
-is weighted down in the fit, without a hint.
+is weighted down in the fit by itself.
 
 ## What is left
 
