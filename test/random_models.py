@@ -34,6 +34,24 @@ def random_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
             return h
 
 
+def falling_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
+    """Return an H of a law that falls where the voltage turns, until its narrowest play moves."""
+    h = random_hysteresis(rng, law)
+    weight = rng.uniform(0.3, 1.0)
+    curves, bias = h.curves, h.bias
+    if curves is not None:
+        # its weight falls to 0.6 of itself over the span
+        curves = np.vstack([[-0.2 * weight, 0.0, 0.0], curves])
+    return replace(
+        h,
+        thresholds=np.append(0.001, h.thresholds),
+        weights=np.append(weight, h.weights),
+        p2=h.p2 - h.lowest_slope() - rng.uniform(0.1, 0.5) * weight,
+        curves=curves,
+        bias=None if bias is None else np.append(0.0, bias),
+    )
+
+
 def random_path(rng: np.random.Generator, n: int) -> np.ndarray:
     """Return a path within 0 .. 1: noise, a walk, a sine that grows or shrinks, or jumps."""
     match rng.integers(4):

@@ -20,8 +20,8 @@ from piezo_ident.cli.identify_command import (
     prompt_of,
     read_both,
 )
-from piezo_ident.cli.records import check_order, fields_of, naming
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.cli.records import check_order, fields_of
+from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load

@@ -11,8 +11,7 @@ from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_output
-from piezo_ident.cli.records import naming
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.common.files import write_text
 from piezo_ident.export.fmu import export_fmu
 from piezo_ident.export.header import export_c
@@ -61,7 +60,9 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
             f'{1e3 * preview / model.sample_rate:.4g} ms; --preview N makes it shorter'
         )
     if len(functions) == 1:
-        console.say('  warning: there is no feed-forward; the head of the file says why')
+        head = header.partition('There is no feed-forward:')[2].partition('*/')[0]
+        reason = ' '.join(word for word in head.split() if word != '*')
+        console.say(f'  warning: {args.model}: there is no feed-forward: {reason}')
     console.result(
         {
             'model': str(args.model),

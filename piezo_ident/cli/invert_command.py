@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_table_and_picture
-from piezo_ident.cli.records import check_order, naming, print_faults, read_all
-from piezo_ident.common.errors import DataError
+from piezo_ident.cli.records import check_order, print_faults, read_all
+from piezo_ident.common.errors import DataError, naming
 from piezo_ident.control.inverse import invert
 from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
@@ -35,7 +35,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
     model = load(args.model)
     (reference,) = read_all([args.record], args, console, displacement_alone=True)
     piece = _whole(reference, model)
-    with naming(str(args.record)):
+    with naming(str(args.record), model=str(args.model)):
         drive = invert(
             replace(model, sample_rate=piece.sample_rate),
             piece.y,

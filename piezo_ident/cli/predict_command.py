@@ -12,9 +12,9 @@ from typing import Any
 
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_table_and_picture
-from piezo_ident.cli.records import check_order, data_of, naming, print_faults, read_all
+from piezo_ident.cli.records import check_order, data_of, print_faults, read_all
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
 from piezo_ident.model.initial_memory import unknown_starts

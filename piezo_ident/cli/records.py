@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 import os
 from pathlib import Path
@@ -15,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from piezo_ident.cli.console import Console
-from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.record import io as record_io
 from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
@@ -31,18 +30,6 @@ UNCERTAIN = ('.txt', '.dat', '.asc')
 NOTES = 20_000
 #: what a folder is searched for
 RECORD_FILES = (*(x for x in READERS if x not in UNCERTAIN), *BAG_FILES)
-
-
-@contextmanager
-def naming(*names: str) -> Iterator[None]:
-    """Put the names of the inputs before messages that do not name one of them."""
-    try:
-        yield
-    except PiezoIdentError as error:
-        if any(name in str(error) for name in names):
-            raise
-        text = f'{", ".join(names)}: {error}'
-        raise type(error)(text, options=error.options) from None
 
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:

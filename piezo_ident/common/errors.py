@@ -3,6 +3,9 @@
 
 """The package's own exceptions: each message says what is wrong, where, and what to do."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 #: what a message quotes may come from a file, and be of any length
 _LONGEST = 4000
 
@@ -45,6 +48,24 @@ class IdentificationError(PiezoIdentError):
 
 class Cancelled(PiezoIdentError):
     """The work was stopped on request; nothing was written."""
+
+
+@contextmanager
+def naming(*names: str, model: str = '') -> Iterator[None]:
+    """
+    Put the names of the inputs before messages that do not name one of them.
+
+    Where a `model` is given, what is wrong with the model is said of it alone.
+    """
+    try:
+        yield
+    except PiezoIdentError as error:
+        if model and isinstance(error, ModelError):
+            names = (model,)
+        if any(name in str(error) for name in names):
+            raise
+        text = f'{", ".join(names)}: {error}'
+        raise type(error)(text, options=error.options) from None
 
 
 def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) -> None:

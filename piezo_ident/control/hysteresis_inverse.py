@@ -7,13 +7,17 @@ The inverse of H: the voltage under which H is what is wanted, sample by sample.
 Between two samples H is a function of the new voltage alone, and a rising one where H has an
 inverse.  So each sample is a root of one unknown, which Newton's steps within a bracket find from
 the sample before; the plays then move on, as under the voltage that was found.  That serves every
-law of H alike.  For a sum of plays without a cubic the inverse is a sum of plays again:
+law of H alike.  Where H falls behind a turn of the voltage, within its narrowest plays, these are
+taken for lines: the voltage would jump at each turn otherwise, however small, also at rest.
+
+For a sum of plays without a cubic the inverse is a sum of plays again:
 K. Kuhnen, "Modeling, identification and compensation of complex hysteretic nonlinearities",
 European Journal of Control 9(4), 2003, doi:10.3166/ejc.9.407-418.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +25,7 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, curve_slope, held
 
@@ -32,7 +37,8 @@ TRIALS = 80
 FLAT = 1e-6
 #: voltages at which H is checked to rise beyond its span
 FINE = 513
-#: thresholds, as a share of the span, up to which H may fall after a reversal
+#: thresholds, as a share of the span, of plays that may be taken for lines; taste: a real loop is
+#: several times as wide, and a line misses a play by half its threshold
 NARROW = 0.02
 
 
@@ -197,6 +203,8 @@ class HysteresisInverse:
 
     Attributes
     ----------
+    hysteresis : Hysteresis
+        H as it is inverted, see `rising`.
     limits : tuple of float
         Those given, as far as H rises up to them.
 
@@ -224,13 +232,7 @@ class HysteresisInverse:
         pole: float = 0.0,
         growth: ArrayLike = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
-        slope = hysteresis.lowest_slope()
-        if not (slope > 0.0 or _without_narrow(hysteresis).lowest_slope() > 0.0):
-            raise ModelError(
-                f'the hysteresis of this model has no inverse: its slope falls to {slope:.2g} '
-                'within its range; identify again from a record with larger sweeps'
-            )
-        self.hysteresis = hysteresis
+        self.hysteresis = hysteresis = rising(hysteresis)
         lags = hysteresis.relaxations
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
         self.limits = _rising(hysteresis, float(limits[0]), float(limits[1]))
@@ -284,12 +286,47 @@ class HysteresisInverse:
         return u, reached
 
 
-def _without_narrow(h: Hysteresis) -> Hysteresis:
-    """Return H with its narrowest plays as a straight line: how it rises but for reversals."""
-    least, most = h.span
-    narrow = h.thresholds <= NARROW * (most - least)
-    weights = np.where(narrow, 0.0, h.weights)
-    return replace(h, weights=weights, p2=h.p2 + float(h.weights[narrow].sum()))
+def rising(hysteresis: Hysteresis, volts: Callable[[float], float] = float) -> Hysteresis:
+    """
+    Return an H that rises with the voltage, by as few of its narrowest plays as lines as it takes.
+
+    ModelError, with the voltage where it falls by `volts` of the normalised one, where no such
+    lines make it rise.
+    """
+    low, high = hysteresis.span
+    narrow = int(np.sum(hysteresis.thresholds <= NARROW * (high - low)))
+    found, lines = hysteresis, 0
+    while found.lowest_slope() <= 0.0 and lines < narrow:
+        lines += 1
+        found = hysteresis.with_lines(lines)
+    slope, u = found.flattest
+    if not slope > 0.0:
+        raise ModelError(
+            f'the hysteresis of this model has no inverse: its slope falls to {slope:.2g} at '
+            f'{volts(u):.4g} V; identify again from a record with larger sweeps'
+        )
+    return found
+
+
+def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
+    """
+    Return a model whose H rises with the voltage, and a warning where that is another H.
+
+    Raises
+    ------
+    ModelError
+        When H falls by more than its narrowest plays.
+    """
+    h = model.hysteresis
+    found = rising(h, model.scaling.v)
+    if found is h:
+        return model, ()
+    slope, u = h.flattest
+    widest = float(h.thresholds[found.thresholds != h.thresholds].max()) * model.scaling.V
+    return replace(model, hysteresis=found), (
+        f'where the voltage turns, at {model.scaling.v(u):.4g} V, the slope of the hysteresis '
+        f'falls to {slope:.2g}: plays of up to {widest:.3g} V are inverted as lines',
+    )
 
 
 def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
@@ -302,7 +339,7 @@ def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, flo
     w = hysteresis(np.concatenate([v, v[::-1]]))
     up, down = np.diff(w[:FINE]), -np.diff(w[FINE:])[::-1]
     # and where all plays stand
-    still = hysteresis.p2 * v + hysteresis.p0 * v**2 + hysteresis.p1 * v**3
-    falls = (up <= 0.0) | (down <= 0.0) | (np.diff(still) <= 0.0)
+    stands = hysteresis.slope_at_turns(v[1:]) <= 0.0
+    falls = (up <= 0.0) | (down <= 0.0) | stands
     below, above = v[1:][falls & (v[1:] <= least)], v[:-1][falls & (v[:-1] >= most)]
     return max([low, v[0], *below]), min([high, v[-1], *above])

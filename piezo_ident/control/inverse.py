@@ -25,7 +25,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
 from piezo_ident.control.expectation import expect, known_rms
-from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
 from piezo_ident.control.inputs import checked_limits, checked_motion, padded
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.control.rate_inverse import RateInverse
@@ -186,7 +186,8 @@ def invert(
     s = model.scaling
     low, high, slew = given = checked_limits(model, limits, slew)
     ends = float(s.u(low)), float(s.u(high))
-    H, linear = _of_hysteresis(model, ends, slew / s.V / model.sample_rate)
+    inverted, warnings_of_h = with_rising_hysteresis(model)
+    H, linear = _of_hysteresis(inverted, ends, slew / s.V / model.sample_rate)
     Q = linear_inverse(linear)
     low, high = map(s.v, H.limits)
     if not low < high:
@@ -245,7 +246,7 @@ def invert(
         if np.abs(x[used] - e[used] - s.x(predicted)).max() < RESTS * span:
             break
     e, t, short, miss = e[used], t[used], short[used], miss[used]
-    warnings = []
+    warnings = list(warnings_of_h)
     if short.any():
         most = abs(s.Y) * float(miss[short].max())
         at_top = u[used][short] > 0.5 * sum(H.limits)
@@ -266,7 +267,8 @@ def invert(
     if left > max(MATTERS, relative):
         warnings.append(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
-            'motion is faster than the stage, or jumps, or an effect leaves no voltage for it'
+            'motion is faster than the stage, or jumps, or no voltage makes up for an effect or a '
+            'line'
         )
     warnings += _extrapolated(model, v, y)
     goal = np.pad(y, (lead, 0), mode='edge')[used]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
-from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
 from piezo_ident.control.inputs import checked_limits
 from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import (
@@ -32,7 +32,6 @@ from piezo_ident.control.linear_inverse import (
     linear_inverse,
     LinearInverse,
 )
-from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
@@ -134,9 +133,11 @@ class LiveInverse:
         self.model, self.warnings = _without_channels(model)
         self.preview = int(preview)
         check_preview(model, self.preview)
-        self._filter = linear_inverse(self.model)
+        inverted, lines = with_rising_hysteresis(self.model)
+        self.warnings += lines
+        self._hysteresis, self._filter = inverted.hysteresis, linear_inverse(inverted)
         self.passes, self.error = self._tried()
-        if self.error > LARGE:
+        if self.error > LARGE and not lines:
             self.warnings += (
                 f'a preview of {preview} samples in {self.passes} passes leaves '
                 f'{self.error:.2g} % of stroke on a slow motion, were the model exact; '
@@ -154,7 +155,7 @@ class LiveInverse:
         return [
             _Pass(
                 self.model,
-                HysteresisInverse(self.model.hysteresis, bounds, slew / s.V / rate),
+                HysteresisInverse(self._hysteresis, bounds, slew / s.V / rate),
                 Q,
                 wait,
                 passes - 1 - k,
@@ -346,11 +347,7 @@ class _Pass:
 
 def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
     """Return a model without effects of further channels, which have no preview."""
-    left = [
-        setting
-        for setting in model.effects
-        if any(p.name == 'channel' for p in find_effect(setting.name).parameters)
-    ]
+    left = [setting for setting in model.effects if setting.channel]
     if not left:
         return model, ()
     names = ', '.join(setting.name for setting in left)

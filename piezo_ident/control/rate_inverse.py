@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.control.hysteresis_inverse import HysteresisInverse
+from piezo_ident.control.hysteresis_inverse import HysteresisInverse, rising
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.control.rate_tangent import tangent
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
@@ -83,6 +83,7 @@ class RateInverse:
         limits: tuple[float, float] = (-np.inf, np.inf),
         step: float = np.inf,
     ) -> None:
+        hysteresis = rising(hysteresis)
         self._effect = RateDependentHysteresis(sample_rate, parameters, hysteresis)
         names = 'gain', 'stretch', 'lead', 'lead_stretch'
         growth = [self._effect.number(name) for name in names]

@@ -24,7 +24,11 @@ from piezo_ident import __version__
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, expect, ModelError
 from piezo_ident.common.kernel import STILL
-from piezo_ident.control.hysteresis_inverse import HysteresisInverse, TOLERANCE, TRIALS
+from piezo_ident.control.hysteresis_inverse import (
+    TOLERANCE,
+    TRIALS,
+    with_rising_hysteresis,
+)
 from piezo_ident.control.inputs import checked_limits
 from piezo_ident.control.inverse import SHORT
 from piezo_ident.control.linear_inverse import (
@@ -55,6 +59,8 @@ class _FeedForward:
     highest: str
     step: str
     says: Sequence[str]
+    front: LinkGroup
+    part: str
     inverted: LinkGroup
 
 
@@ -124,9 +130,13 @@ def export_c(
     why, ff = 'it was not asked for', None
     if feedforward:
         try:
-            ff = _feedforward(model, front, back, kept, preview)
+            ff = _feedforward(model, kept, preview)
         except ModelError as error:
             why = str(error)
+    parts = {'front': front, 'linear': linear, 'back': back}
+    if ff is not None and ff.part not in parts:
+        parts[ff.part] = ff.front
+        links += ff.front.links
     scaling = model.scaling
     values: dict[str, Any] = {
         'p': name,
@@ -137,7 +147,7 @@ def export_c(
         'rate': c_number(model.sample_rate),
         **{k: c_number(getattr(scaling, k)) for k in ('v0', 'V', 'y0', 'Y')},
         'links': links,
-        'parts': {'front': front, 'linear': linear, 'back': back},
+        'parts': parts,
         'channels': channels,
         'channel_names': [plain_text(name) for name in channels],
         'why': textwrap.wrap(why, WIDTH),
@@ -161,13 +171,17 @@ def export_c(
 
 def _feedforward(
     model: StageModel,
-    front: LinkGroup,
-    back: LinkGroup,
     kept: tuple[float, float, float],
     preview: int | None,
 ) -> _FeedForward:
     """Return what inverts a model; ModelError when it has no inverse."""
-    HysteresisInverse(model.hysteresis)
+    model, lines = with_rising_hysteresis(model)
+    front, _, back = links_of(model)
+    part = 'front'
+    if lines:
+        # beside that of the prediction
+        part = 'rising'
+        front = LinkGroup([replace(link, tag=f'{part}_{link.tag}') for link in front.links])
     in_front = [link.name for link in front.links]
     rest = tuple(e for e in model.effects if e.name not in in_front)
     Q = whole = linear_inverse(replace(model, effects=rest))
@@ -193,13 +207,16 @@ def _feedforward(
         lowest=c_number(low),
         highest=c_number(high),
         step=c_number(most / model.sample_rate),
-        says=_says(model, front, inverted, back, Q, whole.ahead),
+        says=_says(model, lines, front, inverted, back, Q, whole.ahead),
+        front=front,
+        part=part,
         inverted=inverted,
     )
 
 
 def _says(
     model: StageModel,
+    lines: Sequence[str],
     front: LinkGroup,
     inverted: LinkGroup,
     back: LinkGroup,
@@ -222,6 +239,7 @@ def _says(
         'what the model does not know: noise, and its own error',
         f'motion at which the gain of G is below {least_gain(model):.0%} of the static one: there '
         'the voltage is kept small',
+        *(f'narrow plays: {line}' for line in lines),
     ]
     if Q.ahead < ahead:
         lacks.append(f'what the filter would take from samples {Q.ahead + 1} to {ahead} ahead')

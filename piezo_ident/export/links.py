@@ -75,7 +75,7 @@ class LinkGroup:
     def statements(self, prefix: str, what: str, channels: Sequence[str]) -> Iterator[str]:
         """Give the statements that put `x` through the part; its state is ``*s``."""
         for link in self.links:
-            if self.is_wrapped and link.tag == 'hysteresis':
+            if self.is_wrapped and link.name == 'H':
                 yield 'u = x;'
             call = link.call(prefix, what, 's')
             if link.code.channel:

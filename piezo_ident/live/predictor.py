@@ -106,8 +106,14 @@ class Predictor:
         Raises
         ------
         ModelError
-            When its sampling rate differs from that of the stream.
+            When its sampling rate differs from that of the stream, or it needs a further channel.
         """
+        for setting in model.effects:
+            if setting.channel:
+                raise ModelError(
+                    f'effect {setting.name} needs the further channel {setting.channel!r}, which '
+                    'does not come with the voltage; take the effect out of the model'
+                )
         if np.isfinite(self._clock.period):
             self._check_rate(model)
         self.model = model

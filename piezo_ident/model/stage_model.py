@@ -58,6 +58,11 @@ class EffectSetting:
         """The place in the chain."""
         return find_effect(self.name).slot
 
+    @property
+    def channel(self) -> str:
+        """The further measured signal that it depends on; empty without one."""
+        return str(self.parameters.get('channel', ''))
+
 
 @dataclass(frozen=True, eq=False)
 class StageModel:

@@ -11,7 +11,7 @@ import queue
 import threading
 from typing import Generic, TypeVar
 
-from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.common.errors import naming, PiezoIdentError
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.model.files import load, model_from_dict
 from piezo_ident.model.stage_model import StageModel
@@ -69,7 +69,8 @@ class ModelLoader(Generic[T]):
         PiezoIdentError
         """
         try:
-            self._take(self._prepare(load(path)), path)
+            with naming(path):
+                self._take(self._prepare(load(path)), path)
         except PiezoIdentError as error:
             raise PiezoIdentError(f'model: {error}') from None
 
@@ -98,7 +99,8 @@ class ModelLoader(Generic[T]):
             while not self._wishes.empty():
                 source, read = self._wishes.get()
             try:
-                self._loaded.put((self._prepare(read()), source))
+                with naming(source):
+                    self._loaded.put((self._prepare(read()), source))
             except PiezoIdentError as error:
                 self._loaded.put((None, ' '.join(str(error).split())))
             # a file or text from outside must not end the node, whatever is in it

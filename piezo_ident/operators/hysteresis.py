@@ -43,6 +43,9 @@ POWERS = 3
 LANES = 8
 #: how far a density may fall below zero, as a share of the largest, by rounding
 ROUNDING = 1e-9
+#: threshold, as a share of the span, below which a play is a line: no converter makes so small a
+#: step
+LINE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,27 +203,66 @@ class Hysteresis:
         return np.asarray(self.weights + bias * (v - self.span[0]) + np.where(inside, curved, 0.0))
 
     def lowest_slope(self) -> float:
-        """
-        Return a lower bound of dw/dv over the span; H has an inverse where it is positive.
+        """Return a lower bound of dw/dv over the span; H has an inverse where it is positive."""
+        return self.flattest[0]
 
-        With lags along the path, the lowest slope of sweeps between any two of nine voltages.
+    @functools.cached_property
+    def flattest(self) -> tuple[float, float]:
+        """
+        A lower bound of dw/dv over the span, and the voltage where it is.
+
+        With lags along the path, sweeps between any two of nine voltages count, too.
         """
         low, high = self.span
+        places = np.linspace(low, high, 129)
+        slope = self.slope_at_turns(places)
         if self.relaxations is not None:
             levels = np.linspace(low, high, 9)
             ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
             legs = [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise(ends) if a != b]
-            places = np.concatenate(legs)
-            return float(np.min(np.diff(self(places)) / np.diff(places)))
-        v = np.linspace(low, high, 129)
+            v = np.concatenate(legs)
+            places = np.append(places, v[1:])
+            slope = np.append(slope, np.diff(self(v)) / np.diff(v))
+        k = int(np.argmin(slope))
+        return float(slope[k]), float(places[k])
+
+    def slope_at_turns(self, v: Array) -> Array:
+        """
+        Return a lower bound of dw/dv behind a turn of the voltage, where plays stand; shapes (n,).
+
+        Plays that are lines move all the same.  Lags along the path have come to rest.
+        """
         slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
+        low, high = self.span
+        r = self.thresholds
+        lines = r < LINE * (high - low)
+        if lines.any():
+            # a little below the voltage, as a curve is flat beyond its width
+            slope = slope + [float(self.rise(x - 2.0 * r, x)[lines].sum()) for x in v]
         if self.bias is not None:
             # a play stands anywhere in its band
             down, up = np.minimum(self.bias, 0.0), np.maximum(self.bias, 0.0)
-            least = np.maximum(v[:, None] - low - self.thresholds, 0.0)
+            least = np.maximum(v[:, None] - low - r, 0.0)
             most = np.minimum(v[:, None] - low, self._wide[4])
             slope = slope + least @ up + most @ down
-        return float(slope.min())
+        if self.relaxations is not None:
+            d1, d2, d3 = self.relaxations[:, 1:].sum(axis=0)
+            slope = slope - (d1 + (2.0 * d2 + 3.0 * d3 * v) * v)
+        return np.asarray(slope)
+
+    def with_lines(self, count: int) -> Hysteresis:
+        """Return H with its narrowest plays as lines, each of the stroke that the play has."""
+        low, high = self.span
+        r, share = self.thresholds.copy(), np.ones(self.thresholds.size)
+        r[:count] *= 0.5 * LINE * (high - low) / r[max(count, 1) - 1]
+        # a line moves over the whole span, a play over what its threshold leaves
+        share[:count] = (high - low - self.thresholds[:count]) / (high - low - r[:count])
+        curves, bias = self.curves, self.bias
+        if curves is not None:
+            curves = curves * share[:, None] ** np.arange(2, 2 + curves.shape[1])
+        if bias is not None:
+            bias = bias * share
+        return replace(self, thresholds=r, weights=self.weights * share, curves=curves, bias=bias)
 
     def without_idle(self, nothing: float = 0.0) -> Hysteresis:
         """Return H without the plays that weigh no more than `nothing` anywhere."""

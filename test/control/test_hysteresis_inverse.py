@@ -13,7 +13,7 @@ from piezo_ident.control.hysteresis_inverse import HysteresisInverse
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import LAWS
 import pytest
-from random_models import random_hysteresis, random_path
+from random_models import falling_hysteresis, random_hysteresis, random_path
 
 
 @settings(max_examples=40, deadline=None)
@@ -63,14 +63,25 @@ def test_it_starts_anywhere():
     assert_allclose(inverse.process(h([0.7, 0.2]))[0], [0.7, 0.2], atol=1e-12)
 
 
-def test_h_may_fall_within_its_narrowest_play_alone():
-    # behind each reversal H falls by 0.0005 before the first play moves
-    h = Hysteresis([0.01, 0.4], [0.5, 0.2], 0.0, -0.05)
-    inverse = HysteresisInverse(h)
-    inverse.reset(0.0)
-    w = 0.3 * (1.0 - np.cos(np.arange(2000) / 100))
-    u, reached = inverse.process(w)
-    assert_allclose(reached, w, atol=1e-9)
-    assert_allclose(h(np.append(0.0, u))[1:], w, atol=1e-9)
-    with pytest.raises(ModelError, match='has no inverse'):
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), law=st.sampled_from(LAWS))
+def test_an_h_that_falls_within_narrow_plays_is_inverted_without_jumps(seed, law):
+    rng = np.random.default_rng(seed)
+    h = falling_hysteresis(rng, law)
+    inverse = HysteresisInverse(h, (0.0, 1.0))
+    w0 = inverse.reset(0.5)
+    # a motion, and a ripple at rest, which the inverse of `h` itself answers by jumps at each turn
+    goal = w0 + 0.02 * np.sin(np.arange(400) / 40.0)
+    ripple = goal[-1] + 1e-9 * rng.standard_normal(200)
+    u, reached = inverse.process(np.append(goal, ripple))
+    assert_allclose(reached, np.append(goal, ripple), atol=1e-12)
+    rise = inverse.hysteresis.lowest_slope()
+    assert np.abs(np.diff(u[400:])).max() < 1.1e-8 / rise + 1e-8
+    # beside the play that is a line, by no more than its weight times its threshold
+    error = h(np.append(0.5, u))[1:] - np.append(goal, ripple)
+    assert np.ptp(error) < 1.1 * h.weights[0] * h.thresholds[0] + 1e-9
+
+
+def test_no_line_stands_for_a_wide_play():
+    with pytest.raises(ModelError, match=r'falls to -0\.05 at 0 V'):
         HysteresisInverse(Hysteresis([0.1, 0.4], [0.5, 0.2], 0.0, -0.05))

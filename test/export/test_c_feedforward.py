@@ -25,6 +25,7 @@ LAWS = {
         *([0.1, 0.3, 0.6], [0.3, 0.1, 0.2], 0.1, 0.9),
         **{'p0': 0.1, 'curves': [[0.1], [0.05], [0.2]], 'bias': [0.1, 0.0, 0.2]},
     ),
+    'falls': Hysteresis([0.005, 0.3], [1.0, 0.5], 0.5, -0.3, curves=[[-0.2], [-0.1]]),
     'lags': Hysteresis([0.1], [0.3], -0.1, 0.9, relaxations=[[1.0, 0.05, 0.0, 0.0]]),
 }
 MODELS = {
@@ -35,8 +36,8 @@ MODELS = {
 }
 #: within which a stage is kept
 LIMITS, SLEW = (1.0, 8.0), 4000.0
-#: what is undone up to the jump of its play, or as its channel begins
-COARSE = {'backlash': 0.02, 'cross_coupling': 0.02}
+#: what is undone up to the jump of its play, as its channel begins, or as a line
+COARSE = {'backlash': 0.02, 'cross_coupling': 0.02, 'falls': 2.0}
 
 
 @pytest.fixture(scope='module')

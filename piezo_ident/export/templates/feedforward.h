@@ -30,15 +30,15 @@ typedef struct {
     double v, wanted;
     double x[2 * {{ P }}_TAPS];
     int at;
-    {{ p }}_front front;
+    {{ p }}_{{ ff.part }} front;
     {{ p }}_behind behind;
 } {{ p }}_feedforward;
 
 static inline double {{ p }}_front_at(const void *of, double u)
 {
     const {{ p }}_feedforward *f = (const {{ p }}_feedforward *)of;
-    {{ p }}_front front = f->front;
-    return {{ p }}_front_step(&front, u, u, (f->k - {{ P }}_PREVIEW) / {{ rate }}, f->channel);
+    {{ p }}_{{ ff.part }} front = f->front;
+    return {{ p }}_{{ ff.part }}_step(&front, u, u, (f->k - {{ P }}_PREVIEW) / {{ rate }}, f->channel);
 }
 
 static inline double {{ p }}_behind_at(const void *of, double x)
@@ -52,9 +52,9 @@ static inline double {{ p }}_behind_at(const void *of, double x)
 static inline double {{ p }}_rest_at(const void *of, double u)
 {
     const {{ p }}_feedforward *f = (const {{ p }}_feedforward *)of;
-    {{ p }}_front front;
+    {{ p }}_{{ ff.part }} front;
     {{ p }}_behind behind;
-    const double x = {{ p }}_front_rest(&front, u, u, 0.0, f->channel);
+    const double x = {{ p }}_{{ ff.part }}_rest(&front, u, u, 0.0, f->channel);
     return {{ p }}_behind_rest(&behind, {{ ff.gain }} * x, 0.0, f->channel);
 }
 
@@ -70,7 +70,7 @@ static inline double {{ p }}_feedforward_reset({{ p }}_feedforward *f, double y)
     for (i = 0; i < {{ [channels | length, 1] | max }}; i++)
         f->channel[i] = 0.0;
     u = piezo_root({{ p }}_rest_at, f, f->wanted, low, low, high);
-    x = {{ ff.gain }} * {{ p }}_front_rest(&f->front, u, u, 0.0, f->channel);
+    x = {{ ff.gain }} * {{ p }}_{{ ff.part }}_rest(&f->front, u, u, 0.0, f->channel);
     {{ p }}_behind_rest(&f->behind, x, 0.0, f->channel);
     for (i = 0; i < 2 * {{ P }}_TAPS; i++)
         f->x[i] = x;
@@ -109,7 +109,7 @@ static inline double {{ p }}_feedforward_step({{ p }}_feedforward *f, double y)
     w = (w0 + w1) + (w2 + w3);
     u = piezo_root({{ p }}_front_at, f, w, before, low, high);
     f->v = piezo_held({{ v0 }} + {{ V }} * u, {{ P }}_LOWEST, {{ P }}_HIGHEST);
-    reached = {{ p }}_front_step(&f->front, u, u, (f->k - {{ P }}_PREVIEW) / {{ rate }}, f->channel);
+    reached = {{ p }}_{{ ff.part }}_step(&f->front, u, u, (f->k - {{ P }}_PREVIEW) / {{ rate }}, f->channel);
     f->clipped += fabs(w - reached) > {{ short }};
     f->k += 1.0;
     return f->v;
