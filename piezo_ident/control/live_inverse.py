@@ -137,11 +137,14 @@ class LiveInverse:
         self.warnings += lines
         self._hysteresis, self._filter = inverted.hysteresis, linear_inverse(inverted)
         self.passes, self.error = self._tried()
-        if self.error > LARGE and not lines:
+        if self.error > LARGE:
+            remedy = f'; {MOST_PASSES * self._filter.ahead} are enough for anything'
             self.warnings += (
                 f'a preview of {preview} samples in {self.passes} passes leaves '
-                f'{self.error:.2g} % of stroke on a slow motion, were the model exact; '
-                f'{MOST_PASSES * self._filter.ahead} are enough for anything',
+                f'{self.error:.2g} % of stroke on a slow motion, were the model exact'
+                # no preview makes up for a line
+                + remedy
+                * (not lines),
             )
         self._passes = self._built(self.passes, self._slew)
         self.reset()

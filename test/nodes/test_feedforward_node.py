@@ -15,6 +15,8 @@ from std_msgs.msg import Float64MultiArray
 SIZE = 200
 #: how long a reference pauses before it has ended [s]
 SILENCE = 0.3
+#: H of a model that has no inverse
+FALLS = {'thresholds': [0.1], 'weights': [0.1], 'p1': -0.8, 'p2': 1.5}
 CREEP = {'name': 'creep', 'parameters': {'gain': [0.02], 'time_constant': [0.1]}}
 
 
@@ -75,6 +77,10 @@ def armed(g):
 def test_without_a_model_it_does_not_start(lab):
     ok, said = lab.call('feedforward/start')
     assert not ok and 'there is no model' in said
+    lab.publish_text('model', paper(hysteresis=FALLS))
+    lab.wait(lambda: 'slope falls to' in lab.status('feedforward')['text'], 'the refusal')
+    said = lab.status('feedforward')['text']
+    assert re.search(r'topic model: .* slope falls to -0\.9 at 10 V', said), said
     assert lab.call('feedforward/stop') == (False, 'the node does not drive')
 
 

@@ -18,6 +18,10 @@ from sensor_msgs.msg import JointState
 #: blocks under way at once: half of what the model keeps
 AHEAD = 50
 
+OTHER_AXIS = {
+    'name': 'cross_coupling',
+    'parameters': {'channel': 'x', 'gain': 0.01, 'rate_gain': 0.0, 'frequency': 300.0},
+}
 OTHER = paper(hysteresis={'thresholds': [0.2, 0.5], 'weights': [0.3, 0.2], 'p1': -0.1, 'p2': 0.9})
 
 
@@ -86,6 +90,9 @@ def test_without_a_model_it_waits_and_says_so(lab):
     assert node.status()['level'] == '1' and 'not valid YAML' in node.status()['text']
     lab.publish_text('model', paper(dynamics={'a': [-1.5], 'b': [1.0]}))
     lab.wait(lambda: 'unstable' in node.status()['text'], 'refusal')
+    # no voltage brings the further channel of this one
+    lab.publish_text('model', paper(effects=[OTHER_AXIS]))
+    lab.wait(lambda: "needs the further channel 'x'" in node.status()['text'], 'refusal')
     # voltage that came before the model counts
     prediction = lab.collect('prediction')
     since = len(lab.diagnoses('model'))
