@@ -98,6 +98,8 @@ def example(verdict: str = 'named') -> Diagnosis:
     record = measured()
     (piece,) = record.pieces
     given = piece.y - slow_model().predict_piece(piece)
+    h = slow_model().hysteresis
+    other_h = replace(slow_model(), hysteresis=replace(h, p2=1.02 * h.p2))
     before = given - given.mean()
     added = verdict in ('named', 'class', 'partly_explained')
     refit = verdict == 'refitted'
@@ -129,7 +131,7 @@ def example(verdict: str = 'named') -> Diagnosis:
         verdict=verdict,
         sentence=sentences[verdict],
         given=slow_model(),
-        model=refined_model() if added else slow_model(),
+        model=refined_model() if added else other_h if refit else slow_model(),
         effects=(effect,) if added else (),
         group=group if verdict in ('class', 'refitted') else None,
         unexplained=Unexplained(

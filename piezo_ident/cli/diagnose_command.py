@@ -28,7 +28,7 @@ from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-from piezo_ident.report import changes, diagnosis_text, to_json, validated
+from piezo_ident.report import diagnosis_text, to_json, validated
 
 
 def diagnose_command(args: SimpleNamespace, console: Console) -> None:
@@ -58,14 +58,12 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
-    changed = changes(given, diagnosis.model)
-    note = ', '.join(changed) or f'the same as {args.model_file}, nothing changed'
+    note = ', '.join(diagnosis.changes) or f'the same as {args.model_file}, nothing changed'
     files = print_files(args, console, f' ({note})')
     steps = print_next(diagnosis, prompt, console)
     console.result(
         {
             **to_json(diagnosis),
-            'model_changes': list(changed),
             'validation': [{'formula': FORMULA, **asdict(x)} for x in diagnosis.unseen],
             'files': files,
             'next': steps,

@@ -27,11 +27,12 @@ from piezo_ident.diagnosis.joint_fit import (
     may_be_better,
 )
 from piezo_ident.diagnosis.next_experiment import look_alikes
+from piezo_ident.diagnosis.results import OtherGain
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import centred, Rows
 from piezo_ident.diagnosis.search import gains_of, Selected
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.state import State, WANDERS
 from piezo_ident.diagnosis.toward_given import loops
 from piezo_ident.diagnosis.trial_scores import best_trials
 from piezo_ident.diagnosis.verdict import Findings
@@ -130,7 +131,12 @@ def _selected(
     if found.taken and _is_loose(simulator, given, fitted):
         fitted = refit_of(simulator, fitted.state, 'preisach')
     narrow = beside if found.taken else refit_of(simulator, fitted.state, 'plays')
-    return wide, replace(both, fitted=_narrowest(simulator, narrow, fitted))
+    fitted = _narrowest(simulator, narrow, fitted)
+    gain, most = (wide.mean_square - one.mean_square for one in (fitted, both.fitted))
+    if found.taken and gain < criteria.ADDED * most:
+        # what the effects explain is judged against the widest law without them
+        fitted = both.fitted
+    return wide, replace(both, fitted=fitted)
 
 
 def _narrowest(simulator: Simulator, plays: Fitted, wide: Fitted) -> Fitted:
@@ -168,12 +174,14 @@ def with_refit(
         if not refit_holds(rows, e, refit.transfer):
             # other motion does not bear it out, and yet the given model errs
             return unsettled
-        other = _gain(simulator, given, refit, wanders=_wanders(rows, selected, noise))
+        wanders = _wanders(rows, selected, noise)
+        other = _gain(simulator, given, refit, noise, wanders=wanders)
         if other is not None and not selected.linear:
             # of another record a gain that wanders says nothing
-            wanders = replace(unsettled, gain=other)
-            return wanders.hiding(('gain_drift', *look_alikes('gain_drift')[:1]))
-        findings = findings.refitted(rows.percent(refit.mean_square - noise))
+            of_gain = replace(unsettled, gain=other)
+            return of_gain.hiding((WANDERS, *look_alikes(WANDERS)[:1]))
+        left = rows.percent(refit.mean_square - noise)
+        findings = replace(findings, verdict='refitted', left=left)
     elif misfit < criteria.REFIT_FINDING and not selected.linear:
         return findings
     return findings.hiding(_hidden(simulator, given, selected, findings.verdict == 'refitted'))
@@ -182,30 +190,38 @@ def with_refit(
 def _wanders(rows: Rows, selected: Selected, noise: float) -> bool:
     """Return whether a gain that wanders takes a part of what a refit of H leaves."""
     return any(
-        gains_of(rows, one).get('gain_drift', 0.0)
+        gains_of(rows, one).get(WANDERS, 0.0)
         > criteria.WANDERING * (one.before.mean_square - noise)
         for one in selected.rounds
     )
 
 
-def _gain(simulator: Simulator, given: State, refit: Fitted, *, wanders: bool) -> float | None:
+def _gain(
+    simulator: Simulator, given: State, refit: Fitted, noise: float, *, wanders: bool
+) -> OtherGain | None:
     """
     Return the gain that takes most of what a refit takes, if one does: no other loop is one.
 
     It is another loop where the refit predicts other kinds of excitation better than the gain, and
-    that does not go on to wander: without labels a gain that drifts looks like one.
+    that does not go on to wander: without labels a gain that drifts looks like one.  Beyond the
+    range of the given model its wide plays are unknown, and look like a gain.
     """
     rows, x = simulator.rows, simulator.run(given)
+    # a branch passed once has no second half, as for any effect
+    if rows.passes < criteria.PASSES or rows.leaves(simulator.model.scaling.range):
+        return None
     e = centred(rows.x - x, rows.of_record)
     gain, taken = fitted_gain(rows, x, e)
-    whole = float(e @ e) - float(refit.errors.sum())
+    missed = float(e @ e)
+    whole = missed - float(refit.errors.sum())
     if taken <= criteria.ADDED * whole:
         return None
     is_large = rows.percent((whole - taken) / rows.n) >= criteria.REFIT_FINDING
     with_gain = e - (gain - 1.0) * centred(x, rows.of_record)
     may_be_loop = bool(rows.kinds) and is_large and not wanders
-    is_loop = may_be_loop and refit_holds(rows, with_gain, refit.transfer)
-    return None if is_loop else gain
+    if may_be_loop and refit_holds(rows, with_gain, refit.transfer):
+        return None
+    return OtherGain(gain, taken / max(missed - noise * rows.n, taken))
 
 
 def _hidden(

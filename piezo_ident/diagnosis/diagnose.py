@@ -156,7 +156,10 @@ def diagnose(
     ]
     if not is_whole:
         warnings.append(part_searched(records, part))
-    return replace(result, warnings=(*result.warnings, *warnings))
+    pieces = [piece for record in records for piece in record]
+    outside = sum(int(model.outside(p.v).sum()) for p in pieces) / sum(p.n for p in pieces)
+    result = replace(result, warnings=(*result.warnings, *warnings), outside=outside)
+    return replace(result, sentence=sentence(result))
 
 
 def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list[Record]:
@@ -269,6 +272,9 @@ def _diagnosed(
     refined = refine(simulator, given, last, findings, noise, (before, after))
     if refined.is_given:
         after = before
+        if findings.verdict == 'refitted':
+            # of a refit that is not kept
+            findings = findings.unsettled(rows.percent(left - noise))
     rest = findings.unexplained(left_over(findings, smallest, rows.passes))
     # where no line stands out, and no channel, there is nothing to fit
     tested = {HUM} if lines.searched else set()
@@ -281,9 +287,7 @@ def _diagnosed(
     progress('verdict', 1.0)
     return Diagnosis(
         verdict=findings.verdict,
-        sentence=sentence(
-            findings, (before, refit, after), rest, smallest, refined.is_given, bent
-        ),
+        sentence='',
         given=model,
         model=refined.model,
         effects=found_effects(rows, found.before, selected, found.explainable, last),
@@ -307,10 +311,11 @@ def _diagnosed(
             *(warning for one in selected.rounds for warning in one.warnings),
         ),
         settings=settings,
-        law=law.name if (law := last.state.law) else '',
+        law='' if refined.keeps_h or last.state.law is None else last.state.law.name,
         errors_of_laws=errors_of_laws(rows, (refitted, last, plays, wide)),
         kinds=rows.kinds,
         is_of_refit=findings.of_refit > 0.0,
+        gain=findings.gain,
     )
 
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import LEAST_GAIN, LINEAR, SMALLEST_EFFECT, TUNED
-from piezo_ident.diagnosis.refined_model import Refined, WANDERS
-from piezo_ident.diagnosis.results import Class, Errors, Unexplained
+from piezo_ident.diagnosis.criteria import LEAST_GAIN, SMALLEST_EFFECT, TUNED
+from piezo_ident.diagnosis.refined_model import Refined
+from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.state import Added
+from piezo_ident.diagnosis.state import Added, WANDERS
 from piezo_ident.diagnosis.verdict import Findings
+from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
@@ -26,13 +27,14 @@ def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
     """Return what the unexplained rest is."""
     if smallest is None:
         return (
-            f'the voltage passes its range {passes:.1f} times, so nothing that is fitted could be '
+            f'the voltage passes its range {passes:.1f} times, so no effect could be '
             'tested; drive the range back and forth twice or more'
         )
     if findings.left < smallest:
         return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
     if findings.keeps_given:
-        return 'a refit of the hysteresis takes it here, which need not last or hold elsewhere'
+        what = 'gain' if findings.gain else 'hysteresis'
+        return f'another {what} would take most of it here'
     if findings.verdict == 'none':
         return 'no effect is claimed for what differs from one part of the data to another'
     if not findings.effects:
@@ -130,97 +132,89 @@ def _of_time_driven(added: Added, h_is_given: bool) -> str:
     )
 
 
-def sentence(
-    findings: Findings,
-    errors: tuple[Errors, Errors, Errors],
-    rest: Unexplained,
-    smallest: float | None,
-    is_given: bool,
-    bent: float,
-) -> str:
-    """
-    Return the verdict as a sentence.
+def sentence(result: Diagnosis) -> str:
+    """Return what was found, what became of the model, and what the data leave open."""
+    finding, outcome = _finding(result), _outcome(result)
+    texts = [f'{finding}; {outcome}' if outcome else finding]
+    if result.group and not result.effects:
+        hidden = _or(result.group.names)
+        texts.append(f'{hidden} may hide in the base model, and these data do not tell')
+    elif result.group and result.verdict == 'partly_explained':
+        texts.append(f'whether it is {_or(result.group.names)}, these data do not tell')
+    if result.outside:
+        low, high = result.given.scaling.range
+        texts.append(
+            f'{100.0 * result.outside:.2g} % of the samples lie outside {low:g} .. {high:g} V, '
+            'where the model as given is an extrapolation'
+        )
+    return ' '.join(f'{text[0].upper()}{text[1:]}.' for text in texts)
 
-    The errors are before, with the base refitted, and after; `smallest` is the smallest detectable
-    effect [% of stroke], `is_given` says whether the model stays as it was given, and `bent` is
-    as in `warnings_of`.
-    """
-    before, refit, after = (e.overall for e in errors)
-    fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
-    if is_given:
-        why = 'other motion gains too little'
-        if findings.may_follow_time:
-            why = 'another record may know nothing of that'
-        fall = f'{why}: the model stays as given ({before:.3g} % of stroke)'
+
+def _finding(result: Diagnosis) -> str:
+    """Return what the verdict says."""
+    rest, smallest = result.unexplained, result.smallest_detectable
+    if result.effects:
+        explained = _explained(result)
+        if result.verdict == 'class' and result.group:
+            return f'{_or(result.group.names)}, these data do not tell which: {explained}'
+        if result.verdict == 'partly_explained':
+            return f'{explained}, {rest.rms_percent:.2g} % of stroke stays unexplained'
+        return explained
+    if result.verdict == 'refitted':
+        return 'the hysteresis of the model is not that of these data'
+    if result.verdict == 'unexplained':
+        why = rest.description
+        if result.gain:
+            share, gain = 100.0 * result.gain.share, result.gain.value
+            why = f'{share:.0f} % of it would go with a gain that is {gain:.4g} times what it was'
+        return f'{rest.rms_percent:.2g} % of stroke stays unexplained: {why}'
+    if smallest is None:
+        return rest.description
+    if rest.rms_percent >= smallest:
+        return (
+            f'no effect shows: the {rest.rms_percent:.2g} % of stroke that are left differ from '
+            'one part of the data to another'
+        )
+    return (
+        'no effect is missing that these data could show; the smallest would be '
+        f'{smallest:.2g} % of stroke'
+    )
+
+
+def _explained(result: Diagnosis) -> str:
+    """Return which effects explain how much of what."""
     missed = 'what the model missed'
-    if findings.of_refit and len(findings.effects) == 1:
+    if result.is_of_refit and len(result.effects) == 1:
         missed = 'what a refit of the hysteresis takes'
-    elif findings.effects and not findings.of_refit and refit < 0.5 * before:
+    elif not result.is_of_refit and result.refit.overall < 0.5 * result.before.overall:
         # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
-        fall += '' if is_given else f', with the refit alone to {refit:.3g} %'
-    share = f'{100.0 * findings.share:.0f} % of {missed}'
-    names = ' and '.join(name.replace('_', ' ') for name in findings.effects)
-    was, explains = ('was', 'explains') if len(findings.effects) == 1 else ('were', 'explain')
-    tail = '' if is_given else f'; after a refit of the hysteresis {fall}'
-    gains = before > np.hypot(refit, SMALLEST_EFFECT)
-    if is_given and gains and not findings.keeps_given:
-        tail = (
-            f'; a refit of the hysteresis lowers the error from {before:.3g} to {refit:.3g} % of '
-            'stroke here, and need not hold elsewhere, so the model stays as given'
-        )
-    if findings.verdict == 'named':
-        text = f'{names} {explains} {share}; {fall}.'
-    elif findings.verdict == 'class':
-        text = f'{_or(findings.group)}: these data do not tell which; {names} {was} added and '
-        text += f'{explains} {share}; {fall}.'
-    elif findings.verdict == 'partly_explained':
-        text = (
-            f'{names} {explains} {share}, {rest.rms_percent:.2g} % of stroke stays unexplained; '
-        )
-        text += f'{fall}.'
-        if findings.group:
-            text += f' Whether it is {_or(findings.group)}, these data do not tell.'
-    elif findings.verdict == 'refitted':
-        text = f'the hysteresis of the model is not that of these data: refitted alone, {fall}.'
-        if bent >= LINEAR:
-            text = (
-                'the hysteresis and the dynamics of the model are not those of these data: '
-                f'refitted, with no effect added, {fall}.'
-            )
-        if is_given:
-            text = (
-                'the hysteresis of the model is not that of these data: a refit lowers the error '
-                f'on held-out data from {before:.3g} to {refit:.3g} % of stroke. It gains too '
-                'little on the whole record or on other motion, or knows where loops were and not '
-                'what they look like, so the model stays as given.'
-            )
-    elif findings.verdict == 'unexplained':
-        why = ' that no candidate explains: unexplained'
-        if findings.keeps_given and findings.group:
-            why = f', most of it by a gain that is {findings.gain:.4g} times what it was'
-        elif findings.keeps_given:
-            why = (
-                f': a refit of the hysteresis leaves {refit:.3g} % of these data, but does not '
-                'hold on motion held out'
-            )
-        elif smallest is None:
-            why = f', unexplained: {rest.description}'
-        text = f'The model misses {rest.rms_percent:.2g} % of stroke{why}{tail}.'
-    elif smallest is None:
-        text = f'{rest.description}{tail}.'
-    elif rest.rms_percent >= smallest:
-        text = f'No effect shows: the {rest.rms_percent:.2g} % of stroke that are left differ '
-        text += f'from one part of the data to another{tail}.'
-    else:
-        text = 'No effect is missing that these data could show; the smallest would be '
-        text += f'{smallest:.2g} % of stroke{tail}.'
-    if findings.group and not findings.effects:
-        hidden = _or(findings.group).capitalize()
-        text += f' {hidden} may hide in the base model, and these data do not tell.'
-    return text[0].upper() + text[1:]
+    names = ' and '.join(effect.name.replace('_', ' ') for effect in result.effects)
+    explains = 'explains' if len(result.effects) == 1 else 'explain'
+    share = 100.0 * (1.0 - result.unexplained.share)
+    # a line that a test of its own has shown may be little of what is missed
+    return f'{names} {explains} {share:{".0f" if share >= 1.0 else ".1g"}} % of {missed}'
 
 
-def _or(group: Class | None) -> str:
-    *most, last = (name.replace('_', ' ') for name in (group.names if group else ('',)))
+def _outcome(result: Diagnosis) -> str:
+    """Return what became of the model, and of its error; empty where there was nothing to do."""
+    before, refit, after = (e.overall for e in (result.before, result.refit, result.after))
+    if result.changes:
+        fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'
+        if any(find_effect(effect.name).time_driven for effect in result.effects):
+            fall += ' in these records alone'
+        if not result.effects:
+            return f'after a refit of the hysteresis {fall}'
+        is_larger = not result.is_of_refit and refit < 0.5 * before
+        return f'{fall}, with the refit alone to {refit:.3g} %' if is_larger else fall
+    stays = f'in another record, so the model stays as given ({before:.3g} % of stroke)'
+    if result.effects:
+        return f'what was found need not hold {stays}'
+    if before > np.hypot(refit, SMALLEST_EFFECT):
+        return f'a refit of the hysteresis leaves {refit:.3g} % here, which need not hold {stays}'
+    return ''
+
+
+def _or(names: Sequence[str]) -> str:
+    *most, last = (name.replace('_', ' ') for name in names)
     return f'{", ".join(most)} or {last}' if most else last

@@ -16,7 +16,7 @@ from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import Errors, FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import Added, State
+from piezo_ident.diagnosis.state import Added, State, WANDERS
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import expected_error
@@ -24,8 +24,6 @@ from piezo_ident.model.stage_model import StageModel
 
 #: a weight below this is left out of the refined model, normalised
 NOTHING = 1e-9
-#: effect that is a gain which changes with time
-WANDERS = 'gain_drift'
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +39,11 @@ class Refined:
     shifts: Array
     is_given: bool = False
     h_is_given: bool = False
+
+    @property
+    def keeps_h(self) -> bool:
+        """Whether the file has the H as given."""
+        return self.is_given or self.h_is_given
 
 
 def lasting(effects: tuple[str, ...]) -> list[str]:

@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
-from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Fault, Piece
 
 FORMULA = (
@@ -106,6 +107,18 @@ class Class:
 
 
 @dataclass(frozen=True)
+class OtherGain:
+    """
+    Gain of the stage over that of the model, and what it accounts for.
+
+    Its `share` (0 .. 1) is of what the model as given misses beyond the noise.
+    """
+
+    value: float
+    share: float
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A candidate that was not added: its share of the explainable part alone, and why not."""
 
@@ -196,7 +209,7 @@ class Diagnosis(Showable):
     sentence : str
         The verdict for a reader.
     given, model : StageModel
-        The model that was judged, and the refined one.
+        The model that was judged, and the refined one; the same where it stays as given.
     effects : tuple of FoundEffect
         In the order in which they were found.
     group : Class or None
@@ -235,6 +248,10 @@ class Diagnosis(Showable):
     is_of_refit : bool
         Whether shares, but of candidates that follow time or rate, are of what a refit of H takes,
         since the effect does that beside the H as given.
+    gain : OtherGain or None
+        Where another gain accounts for most of what a refit of H takes.
+    outside : float
+        Share of the samples whose voltage lies outside the range of the given model.
 
     Examples
     --------
@@ -274,3 +291,40 @@ class Diagnosis(Showable):
     errors_of_laws: Mapping[str, float] = field(default_factory=dict)
     kinds: tuple[str, ...] = ()
     is_of_refit: bool = False
+    gain: OtherGain | None = None
+    outside: float = 0.0
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """How the refined model differs from the given one; empty where it stays as given."""
+        return changes(self.given, self.model)
+
+
+def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
+    """Return how a refined model differs from the one that it came from; empty if not at all."""
+    texts = []
+    # a play without weight is none
+    old, new = (m.hysteresis.without_idle().numbers for m in (given, refined))
+    if not np.array_equal(old, new):
+        texts.append('H refitted')
+    if given.scaling != refined.scaling:
+        texts.append('offset refitted')
+    if given.delay != refined.delay:
+        texts.append('another delay')
+    G, other = given.dynamics, refined.dynamics
+    if not (np.array_equal(G.a, other.a) and np.array_equal(G.b, other.b)):
+        texts.append('G retuned')
+    before = {e.name: _frozen(e.parameters) for e in given.effects}
+    after = {e.name: _frozen(e.parameters) for e in refined.effects}
+    texts += [_with(e) for e in refined.effects if e.name not in before]
+    texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
+    return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
+
+
+def _with(added: EffectSetting) -> str:
+    idle = find_effect(added.name).is_neutral(added.parameters)
+    return f'with {added.name}{", switched off" if idle else ""}'
+
+
+def _frozen(values: Mapping[str, object]) -> list[tuple[str, str]]:
+    return sorted((k, repr(np.asarray(x).tolist())) for k, x in values.items())

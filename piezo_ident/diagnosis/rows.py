@@ -136,6 +136,11 @@ class Rows:
         low, high = self.driven
         return high - low >= COVERED * (span[1] - span[0])
 
+    def leaves(self, span: Sequence[float]) -> bool:
+        """Return whether they were driven so far out of a span [V] that H is unknown there."""
+        (low, high), (least, most) = self.driven, span
+        return most - least < COVERED * (max(high, most) - min(low, least))
+
     @property
     def passes(self) -> float:
         """How often the command passed over its range, there or back."""
@@ -273,8 +278,7 @@ def make_rows(
             'voltage, or drives the stage over its whole range'
         )
     longest = max(1, kept // BLOCKS)
-    blocks: list[Integers] = []
-    labels: list[str] = []
+    blocks, labels = list[Integers](), list[str]()
     first = 0
     for run, good in zip(runs, keep, strict=True):
         number = np.full(good.size, -1)

@@ -21,6 +21,8 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 CREEP = 'creep'
 #: and the one that it looks like beside an H that is no sum of plays
 DRIFT = 'thermal_drift'
+#: effect that is a gain which changes with time
+WANDERS = 'gain_drift'
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,12 +28,13 @@ from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
     DiagnosisSettings,
+    OtherGain,
     Unexplained,
     Untestable,
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import gains_of, Round, Selected
-from piezo_ident.diagnosis.state import CREEP, DRIFT
+from piezo_ident.diagnosis.state import CREEP, DRIFT, WANDERS
 from piezo_ident.effects import catalogue, find_effect
 
 
@@ -54,8 +55,8 @@ class Findings:
         Beyond the noise, rms in % of stroke.
     keeps_given : bool
         Whether the model stays as it was given, whatever a refit would bring.
-    gain : float
-        Of the stage over that of the model, where that is most of what the model misses.
+    gain : OtherGain or None
+        Where another gain does most of what a refit of H does.
     of_refit : float
         Mean square that a refit of H takes, where an effect does that beside the H as given and
         shares are of it; else 0.
@@ -67,7 +68,7 @@ class Findings:
     group: Class | None
     left: float
     keeps_given: bool = False
-    gain: float = 1.0
+    gain: OtherGain | None = None
     of_refit: float = 0.0
 
     @property
@@ -81,10 +82,6 @@ class Findings:
     def unsettled(self, left: float) -> Findings:
         """Return that what a refit of H would take need not last, or hold on other motion."""
         return replace(self, verdict='unexplained', left=left, keeps_given=True)
-
-    def refitted(self, left: float) -> Findings:
-        """Return that a refit of H alone brought what there was to gain."""
-        return replace(self, verdict='refitted', left=left)
 
     def hiding(self, names: tuple[str, ...]) -> Findings:
         """Return that H may hide one of several effects."""
@@ -243,9 +240,8 @@ def candidates_of(
 
     `aside` are those that were not tried, and why.
     """
-    possible = {name for one in rounds for name in one.best}
     group = findings.group.names if findings.group else ()
-    possible |= {*findings.effects, *group}
+    possible = {*findings.effects, *group, *(name for one in rounds for name in one.best)}
     visible = _visible(rounds)
     shares: dict[str, float] = {}
     last: dict[str, Round] = {}
@@ -260,6 +256,9 @@ def candidates_of(
             if name not in shares or find_effect(name).rate_independent
         }
         last |= dict.fromkeys(one.best, one)
+    if findings.gain and WANDERS in shares:
+        # as the sentence tells it
+        shares[WANDERS] = findings.gain.share
     found = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
         # what these data cannot show is among the untestable
@@ -348,6 +347,8 @@ def smallest_detectable(
 def _why_not(name: str, share: float, findings: Findings, last: Round, passes: float) -> str:
     best = ' and '.join(findings.effects)
     if findings.group and name in findings.group.names:
+        if findings.gain and name == WANDERS:
+            return f'a gain of {findings.gain.value:.4g} explains that of what the model misses'
         if not findings.effects:
             return 'may hide in the base model'
         does = 'does nearly what a refit of the hysteresis does, like'

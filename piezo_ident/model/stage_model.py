@@ -19,7 +19,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
@@ -348,15 +348,20 @@ class StageModel:
                 f'{self.sample_rate:g} Hz; identify a model from data of that rate'
             )
 
+    def outside(self, v: Array) -> Mask:
+        """Return which voltages [V] lie outside the range of the identification."""
+        low, high = self.scaling.range
+        slack = 1e-3 * (high - low)
+        return np.asarray((v < low - slack) | (v > high + slack))
+
     def extrapolation(self, record: Record) -> tuple[str, ...]:
         """Return a warning when the voltage differs from that of the identification."""
         low, high = self.scaling.range
         least, most = record.voltage_range
         identified = f'the identified range {low:g} .. {high:g} V'
         reach = f'{record.name}: the voltage spans {least:g} .. {most:g} V'
-        slack = 1e-3 * (high - low)
-        if least < low - slack or most > high + slack:
-            outside = sum(int(np.sum((p.v < low - slack) | (p.v > high + slack))) for p in record)
+        outside = sum(int(self.outside(p.v).sum()) for p in record)
+        if outside:
             return (
                 f'{reach}; {outside / record.n:.1%} of the samples lie outside {identified}, '
                 'where the prediction is an extrapolation',

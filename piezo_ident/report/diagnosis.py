@@ -22,7 +22,7 @@ from piezo_ident.diagnosis.results import (
 from piezo_ident.effects import find_effect
 from piezo_ident.model import metrics
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
-from piezo_ident.report.refined import changes, law_told
+from piezo_ident.report.refined import law_told
 from piezo_ident.report.table import (
     FAULTS,
     length,
@@ -162,14 +162,13 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
     """Return the few numbers that stand beside the verdict."""
     errors = zip(STATES, (result.before, result.refit, result.after), strict=True)
-    nothing = 'nothing'
     if result.verdict == 'refitted':
         errors = zip(STATES[::2], (result.before, result.after), strict=True)
-        nothing = 'nothing; H was refitted'
     return [
         ('verdict', result.verdict.replace('_', ' ')),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
-        ('added', ', '.join(e.name for e in result.effects) or nothing),
+        (_kept(result), ', '.join(e.name for e in result.effects) or 'nothing'),
+        ('model', ', '.join(result.changes) or 'stays as given'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
 
@@ -245,6 +244,8 @@ def reversal_text(result: Diagnosis, found: Sequence[Way]) -> str:
         f'Near the reversals (the first {share_text(NEAR)} of the range behind a turn) the model '
         f'as given misses {number(given)} % of stroke, elsewhere {number(elsewhere[0])} %. '
     )
+    if result.effects and not result.changes:
+        return text.rstrip()
     names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
     if result.is_of_refit:
         # a refit does the same
@@ -264,6 +265,11 @@ def _rms(some: Sequence[Way]) -> tuple[float, ...]:
     n = np.array([w.n for w in some])
     squares = np.array([w.rms for w in some]) ** 2
     return tuple(float(x) for x in np.sqrt(n @ squares / n.sum()))
+
+
+def _kept(result: Diagnosis) -> str:
+    """Return whether the effects found are in the refined model."""
+    return 'found, not added' if result.effects and not result.changes else 'added'
 
 
 def _added(result: Diagnosis) -> list[str]:
@@ -313,7 +319,7 @@ def diagnosis_page(
     if result.faults:
         warnings.append('the data had faults, see the table near the end')
     found = ways_of(result)
-    changed = ', '.join(changes(result.given, result.model))
+    changed = ', '.join(result.changes)
     versions = {'piezo_ident': __version__, 'python': python_version(), 'numpy': np.__version__}
     origin = origin_tables(asdict(result.settings), 'the whole catalogue', versions)
     return Page(
@@ -339,7 +345,7 @@ def diagnosis_page(
                 ],
             ),
             Section(
-                'What was added',
+                'What was found',
                 [
                     *_added(result),
                     *_parameter_tables(result),
@@ -371,7 +377,7 @@ def diagnosis_text(result: Diagnosis) -> str:
             *unseen_tables(result),
             reversal_text(result, ways_of(result)),
             Table('', ('', ''), [facts(result)[0], *remains(result)]),
-            *(f'added: {text}' for text in _added(result)),
+            *(f'{_kept(result)}: {text}' for text in _added(result)),
             *_parameter_tables(result),
             f'these data cannot tell apart: {"; ".join(alike)}' if alike else '',
             *_candidate_tables(result, CANDIDATES),

@@ -20,7 +20,6 @@ from piezo_ident.excitation.scaled import scaled
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.report.refined import changes
 from piezo_ident.report.table import listed, number
 from scipy.signal import correlate
 
@@ -140,7 +139,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
             'diagnose again, with that record',
             prompt.command('diagnose', prompt.given, *files, other),
         )
-    is_changed = bool(changes(result.given, result.model))
+    is_changed = bool(result.changes)
     if result.verdict == 'none' and not is_changed:
         yield _use('the model lacks nothing that these data show', prompt, prompt.given)
     elif not result.unseen and is_changed:

@@ -1,20 +1,17 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The refined model of a diagnosis against the given one: what differs, errors elsewhere."""
+"""The refined model of a diagnosis against the given one: errors elsewhere, and its H."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
-from piezo_ident.effects import find_effect
 from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.sines import sine_errors
-from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report.table import number
 
@@ -47,27 +44,6 @@ def _unseen(result: Diagnosis, record: Record) -> Unseen:
     )
 
 
-def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
-    """Return how a refined model differs from the one that it came from; empty if not at all."""
-    texts = []
-    # a play without weight is none
-    old, new = (m.hysteresis.without_idle().numbers for m in (given, refined))
-    if not np.array_equal(old, new):
-        texts.append('H refitted')
-    if given.scaling != refined.scaling:
-        texts.append('offset refitted')
-    if given.delay != refined.delay:
-        texts.append('another delay')
-    G, other = given.dynamics, refined.dynamics
-    if not (np.array_equal(G.a, other.a) and np.array_equal(G.b, other.b)):
-        texts.append('G retuned')
-    before = {e.name: _frozen(e.parameters) for e in given.effects}
-    after = {e.name: _frozen(e.parameters) for e in refined.effects}
-    texts += [_with(e) for e in refined.effects if e.name not in before]
-    texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
-    return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
-
-
 def law_told(result: Diagnosis) -> list[str]:
     """Return whether H is a sum of plays, and what each law leaves on kinds held out."""
     errors = result.errors_of_laws
@@ -76,8 +52,7 @@ def law_told(result: Diagnosis) -> list[str]:
     compared = ', '.join(
         f'{name} {number(x)} %' for name, x in sorted(errors.items(), key=lambda item: -item[1])
     )
-    is_kept = result.verdict != 'refitted' and not changes(result.given, result.model)
-    if is_kept or not result.law:
+    if not result.law:
         about = 'as it was given'
     elif result.law not in LAW_WORDS:
         about = 'a sum of plays'
@@ -88,12 +63,3 @@ def law_told(result: Diagnosis) -> list[str]:
     return [
         f'{about}; refitted with nothing added, laws of H predict what was held out to {compared}'
     ]
-
-
-def _with(added: EffectSetting) -> str:
-    idle = find_effect(added.name).is_neutral(added.parameters)
-    return f'with {added.name}{", switched off" if idle else ""}'
-
-
-def _frozen(values: Mapping[str, object]) -> list[tuple[str, str]]:
-    return sorted((k, repr(np.asarray(x).tolist())) for k, x in values.items())

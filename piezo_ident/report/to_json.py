@@ -188,6 +188,8 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
             for effect in result.effects
         ],
         'class': None if group is None else asdict(group),
+        'gain': None if result.gain is None else asdict(result.gain),
+        'model_changes': list(result.changes),
         'unexplained': {
             'share_of_explainable': _share(left.share),
             'rms_percent_of_stroke': _size(left.rms_percent),
@@ -209,6 +211,7 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
         'hysteresis': {'law': result.law, 'errors_of_laws': dict(result.errors_of_laws)},
         'shares_are_of_refit': result.is_of_refit,
         'held_out_kinds': list(result.kinds),
+        'share_outside_range': result.outside,
         'untestable': [asdict(x) for x in result.untestable],
         'data_faults': [asdict(fault) for fault in result.faults],
         'records': list(result.records),

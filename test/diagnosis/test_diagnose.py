@@ -324,7 +324,6 @@ def test_a_refit_that_other_motion_does_not_bear_out_is_not_nothing(monkeypatch)
     monkeypatch.setattr(base_refit, 'refit_holds', lambda *_: False)
     result = diagnose(model, bent, FEW)
     assert (result.verdict, result.effects, result.group) == ('unexplained', (), None)
-    assert 'does not hold on motion held out' in result.sentence
     assert result.model is model and result.after.overall == result.before.overall > 0.2
 
 
@@ -334,9 +333,8 @@ def test_a_refit_that_knows_only_where_loops_were_is_not_kept(monkeypatch, takes
     if not takes:
         monkeypatch.setattr(refined_model, 'takes_shape', lambda *_: False)
     result = diagnose(model, bent, FEW)
-    assert result.verdict == 'refitted'
+    assert result.verdict == ('refitted' if takes else 'unexplained')
     assert (result.model is not model) == takes
-    assert ('where loops were' in result.sentence) != takes
 
 
 @pytest.mark.parametrize('has_labels', [True, False])
@@ -349,7 +347,6 @@ def test_without_labels_a_refit_must_gain_more_to_be_kept(monkeypatch, has_label
     monkeypatch.setattr(criteria, 'WORTH_UNLABELLED', (0.99, 0.99))
     again = diagnose(model, bent, FEW)
     assert (again.model is model) != has_labels
-    assert ('stays as given' in again.sentence) != has_labels
 
 
 @pytest.mark.parametrize('has_labels', [True, False])
@@ -361,7 +358,6 @@ def test_where_nothing_is_missing_only_motion_held_out_changes_the_model(has_lab
     assert result.verdict == 'none', result.sentence
     assert result.refit.overall < 0.5 * result.before.overall
     assert (result.model is model) != has_labels
-    assert ('need not hold elsewhere, so the model stays' in result.sentence) != has_labels
 
 
 @pytest.mark.parametrize('is_found', [True, False])
@@ -411,8 +407,8 @@ def test_another_gain_that_goes_on_to_wander_is_no_other_loop(monkeypatch, share
     selected = SimpleNamespace(rounds=(one,))
     wanders = base_refit._wanders(simulator.rows, selected, 0.5)
     assert wanders == (share > 0.2)
-    gain = base_refit._gain(simulator, given, refit, wanders=wanders)
-    assert gain == (pytest.approx(1.02, abs=0.01) if wanders else None)
+    gain = base_refit._gain(simulator, given, refit, 0.0, wanders=wanders)
+    assert (gain and gain.value) == (pytest.approx(1.02, abs=0.01) if wanders else None)
 
 
 def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():

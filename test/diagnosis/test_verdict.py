@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.diagnosis import criteria, forward_selection, polishing, search
 from piezo_ident.diagnosis.cross_validation import refit_holds, standard_errors, takes_shape
-from piezo_ident.diagnosis.messages import left_over, part_judged, sentence
+from piezo_ident.diagnosis.messages import part_judged
 from piezo_ident.diagnosis.next_experiment import CONTAINS, LOOK_ALIKES, separating_experiment
-from piezo_ident.diagnosis.results import Class, DiagnosisSettings, Errors, Unexplained
+from piezo_ident.diagnosis.results import Class, DiagnosisSettings
 from piezo_ident.diagnosis.search import Selected, stands_out, takes
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.verdict import candidates_of, Findings, judge, rivals_of
@@ -77,33 +77,6 @@ def rivals(rows, *contenders, plays=True):
     return [c.name for c in rivals_of(rows, contenders, 0.0, WHOLE, plays=plays)]
 
 
-def test_a_refit_that_is_not_kept_is_said():
-    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.2, 0.4))
-    findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
-    said = sentence(findings, errors, rest, 0.05, True, 0.0)
-    assert 'from 0.4 to 0.2 % of stroke' in said and 'the model stays as given' in said
-
-
-@pytest.mark.parametrize(('bent', 'what'), [(0.4, 'hysteresis of'), (0.6, 'dynamics of')])
-def test_what_was_refitted_is_said(bent, what):
-    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.2, 0.1))
-    findings, rest = Findings('refitted', 0.0, (), None, 0.1), Unexplained(0.0, 0.1, 'rest')
-    said = sentence(findings, errors, rest, 0.05, False, bent)
-    assert f'{what} the model' in said and 'falls from 0.4 to 0.1 %' in said
-
-
-def test_what_scatters_beyond_the_limit_is_not_called_smaller():
-    errors = tuple(Errors(0.15, {}, {}) for _ in range(3))
-    findings = Findings('none', 0.0, (), None, 0.07)
-    rest = findings.unexplained(left_over(findings, 0.05, 9.0))
-    said = sentence(findings, errors, rest, 0.05, True, 0.0)
-    assert '0.07 % of stroke that are left differ from one part' in said
-    assert 'no effect is claimed' in rest.description
-    small = replace(findings, left=0.03)
-    rest = small.unexplained(left_over(small, 0.05, 9.0))
-    assert 'the smallest would be 0.05 %' in sentence(small, errors, rest, 0.05, True, 0.0)
-
-
 def test_how_much_was_judged_is_said():
     run = SimpleNamespace(piece=SimpleNamespace(n=1000, sample_rate=100.0))
     keep = np.arange(200) >= 120
@@ -112,22 +85,10 @@ def test_how_much_was_judged_is_said():
     assert part_judged(SimpleNamespace(m=5, runs=(run,), keep=(keep | True,))) == []
 
 
-def test_an_effect_that_gains_nothing_elsewhere_leaves_the_model_as_given():
-    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.4, 0.4))
-    found, rest = Findings('named', 0.95, ('creep',), None, 0.1), Unexplained(0.05, 0.1, 'rest')
-    said = sentence(found, errors, rest, 0.05, True, 0.0)
-    assert said.endswith(
-        'other motion gains too little: the model stays as given (0.4 % of stroke).'
-    )
-
-
-def test_what_may_follow_time_alone_leaves_the_model_as_given():
-    errors = tuple(Errors(x, {}, {}) for x in (0.4, 0.3, 0.4))
+def test_what_may_follow_time_alone_may_follow_nothing_else():
     group = Class(('creep', 'gain_drift'), 'record that')
     found = Findings('partly_explained', 0.7, ('creep',), group, 0.1)
     assert found.may_follow_time
-    said = sentence(found, errors, Unexplained(0.3, 0.1, 'rest'), 0.05, True, 0.0)
-    assert 'another record may know nothing of that: the model stays as given (0.4 %' in said
     others = Class(('creep', 'rate_dependent_hysteresis'), 'record that')
     assert not replace(found, group=others).may_follow_time
     assert not replace(found, verdict='class').may_follow_time
@@ -288,9 +249,6 @@ def test_what_explains_a_part_may_be_a_class_too(rows):
     found = verdict(rows, [this], 0.09)
     assert found.verdict == 'partly_explained' and found.effects == ('creep',)
     assert found.group.names == ('creep', 'thermal_drift')
-    errors = tuple(Errors(x, {}, {}) for x in (1.0, 1.0, 0.3))
-    said = sentence(found, errors, Unexplained(0.09, 0.3, 'rest'), 0.05, False, 0.0)
-    assert said.endswith('Whether it is creep or thermal drift, these data do not tell.')
 
 
 def test_an_effect_that_bent_the_dynamics_rivals_a_change_of_them(rows):

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 from diagnosis_examples import example, hostile, measured, refined_model
 import numpy as np
-from piezo_ident.diagnosis.results import Errors, FoundParameter
+from piezo_ident.diagnosis.results import changes, Errors, FoundParameter
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.report import changes, diagnosis_text, validated
+from piezo_ident.report import diagnosis_text, validated
 from piezo_ident.report.diagnosis import (
     diagnosis_page,
     error_table,
