@@ -134,8 +134,8 @@ def _of_time_driven(added: Added, h_is_given: bool) -> str:
 
 def sentence(result: Diagnosis) -> str:
     """Return what was found, what became of the model, and what the data leave open."""
-    finding, outcome = _finding(result), _outcome(result)
-    texts = [f'{finding}; {outcome}' if outcome else finding]
+    outcome = _outcome(result)
+    texts = ['; '.join(filter(None, (_finding(result, outcome), outcome)))]
     if result.group and not result.effects:
         hidden = _or(result.group.names)
         texts.append(f'{hidden} may hide in the base model, and these data do not tell')
@@ -150,8 +150,8 @@ def sentence(result: Diagnosis) -> str:
     return ' '.join(f'{text[0].upper()}{text[1:]}.' for text in texts)
 
 
-def _finding(result: Diagnosis) -> str:
-    """Return what the verdict says."""
+def _finding(result: Diagnosis, outcome: str) -> str:
+    """Return what the verdict says, where the outcome does not."""
     rest, smallest = result.unexplained, result.smallest_detectable
     if result.effects:
         explained = _explained(result)
@@ -163,11 +163,16 @@ def _finding(result: Diagnosis) -> str:
     if result.verdict == 'refitted':
         return 'the hysteresis of the model is not that of these data'
     if result.verdict == 'unexplained':
-        why = rest.description
+        stays = f'{rest.rms_percent:.2g} % of stroke stays unexplained'
         if result.gain:
             share, gain = 100.0 * result.gain.share, result.gain.value
-            why = f'{share:.0f} % of it would go with a gain that is {gain:.4g} times what it was'
-        return f'{rest.rms_percent:.2g} % of stroke stays unexplained: {why}'
+            return (
+                f'{stays}: {share:.0f} % of it would go with a gain that is {gain:.4g} times what '
+                'it was'
+            )
+        # the outcome tells what would take it
+        is_told = outcome and rest.rms_percent > result.refit.overall
+        return stays if is_told else f'{stays}: {rest.description}'
     if smallest is None:
         return rest.description
     if rest.rms_percent >= smallest:

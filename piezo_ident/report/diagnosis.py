@@ -166,9 +166,9 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         errors = zip(STATES[::2], (result.before, result.after), strict=True)
     return [
         ('verdict', result.verdict.replace('_', ' ')),
+        ('model', ', '.join(result.changes) or 'stays as given'),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
         (_kept(result), ', '.join(e.name for e in result.effects) or 'nothing'),
-        ('model', ', '.join(result.changes) or 'stays as given'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
 
@@ -376,7 +376,7 @@ def diagnosis_text(result: Diagnosis) -> str:
             error_table(result),
             *unseen_tables(result),
             reversal_text(result, ways_of(result)),
-            Table('', ('', ''), [facts(result)[0], *remains(result)]),
+            Table('', ('', ''), [*facts(result)[:2], *remains(result)]),
             *(f'{_kept(result)}: {text}' for text in _added(result)),
             *_parameter_tables(result),
             f'these data cannot tell apart: {"; ".join(alike)}' if alike else '',
