@@ -106,7 +106,7 @@ def _unit_of(quantity: str, role: str) -> click.Option:
 
     text = (
         f'Of {role} in the files (default: by the header, else {next(iter(known))}); '
-        f'10{[*known][-2]} where one of the file is that much.'
+        f'with a number, as in 10{[*known][-2]}, what one of the file is, or one volt.'
     )
     return _option(f'--{quantity}-unit', unit, '|'.join(known), text)
 

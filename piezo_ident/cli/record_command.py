@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
-from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all
+from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all, spans
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
@@ -134,7 +134,7 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
         losses = record_io.write(record, args.out, overwrite=args.overwrite, storage=args.storage)
     console.say(
         f'{args.record} -> {args.out}: {len(record.pieces)} pieces, {record.n} samples, '
-        f'{record.duration:.6g} s'
+        f'{record.duration:.6g} s, {spans([record])}'
     )
     print_faults(record, losses, console)
     console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
+import math
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.record import io as record_io
 from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Fault, Record
 
 #: faults that are shown when a record has been read
 SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'large_gain', 'high_voltage')
@@ -153,14 +154,29 @@ def read_all(
             ) from None
         records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
     # before the work: a wrong unit may be what it fails of
-    shown: dict[str, list[str]] = {}
+    shown: dict[Fault, list[Record]] = {}
     for record in records:
         for fault in record.faults:
             if fault.name in SHOWN:
-                shown.setdefault(f'{fault.where} ({fault.action})', []).append(record.name)
-    for text, of in shown.items():
-        console.note(f'{of[0]}{f" and {len(of) - 1} more" if of[1:] else ""}: {text}')
+                shown.setdefault(fault, []).append(record)
+    for fault, of in shown.items():
+        name = f'{of[0].name} and {len(of) - 1} more' if of[1:] else of[0].name
+        reached = spans(of) if fault.is_note else ''
+        console.note(f'{name}: {fault.where} ({fault.action}){reached and "; "}{reached}')
     return records
+
+
+def spans(records: Sequence[Record]) -> str:
+    """Return the strokes and voltages that the numbers in some files stand for."""
+    strokes = [1e6 * record.stroke for record in records]
+    ends = [end for record in records for end in record.voltage_range]
+    parts = []
+    for name, unit, x in (('stroke', 'um', strokes), ('voltage', 'V', ends)):
+        # of one that is not recorded nothing is known
+        if all(map(math.isfinite, x)):
+            both = dict.fromkeys(f'{end:.4g}' for end in (min(x), max(x)))
+            parts.append(f'{name} {" to ".join(both)} {unit}')
+    return ', '.join(parts)
 
 
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:

@@ -22,8 +22,8 @@ from piezo_ident.common.arrays import Array, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
-from piezo_ident.record.options import ReadOptions, unit_factor, UNITS
-from piezo_ident.record.ordering import at_times, in_order, OrderedRows
+from piezo_ident.record.options import ReadOptions, split_unit, unit_factor, UNITS
+from piezo_ident.record.ordering import at_times, in_order, not_uniform, OrderedRows
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 from piezo_ident.record.rounded_time import unrounded
 
@@ -127,7 +127,7 @@ def assemble(
         scaled = {k: x / unit_factor('y', unit) for k, x in moved.items()}
         table = replace(table, columns={**table.columns, **scaled})
     _check_limits(table, options.voltage_limits, name)
-    _check_ranges(table, unit, name)
+    _check_ranges(table, options, name)
     pieces = _pieces(table, epochs, name, sample_rate, met)
     return Record(pieces, name, tuple(met))
 
@@ -226,14 +226,16 @@ def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: 
         )
 
 
-def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
+def _check_ranges(table: OrderedRows, options: ReadOptions, name: str) -> None:
     """Refuse times, voltages and strokes that no piezo stage has."""
+    unit = options.displacement_unit or 'm'
     ends = {'t': table.t, **table.columns}
     ranges = {k: (float(np.nanmin(x)), float(np.nanmax(x))) for k, x in ends.items() if k in 'tvy'}
     latest = max(map(abs, ranges['t']))
     if latest > MAX_TIME:
-        cure = 'name its unit, as in --time-unit ms, or write t in seconds'
-        raise DataError(f'{name}: t reaches {latest:.3g} s; {cure}', options='--time-unit ms')
+        way = f'--time-unit {"1ms" if options.time_unit else "ms"}'
+        cure = f'name its unit, as in {way}, or write t in seconds'
+        raise DataError(f'{name}: t reaches {latest:.3g} s; {cure}', options=way)
     moved = {k: high - low for k, (low, high) in ranges.items() if k != 't'}
     span = moved.get('v', 0.0)
     idle = span == 0.0  # a stage at rest has no stroke, whatever the unit
@@ -253,10 +255,15 @@ def _check_ranges(table: OrderedRows, unit: str, name: str) -> None:
                 )
         others = {u: stroke * read / factor for u, factor in UNITS['y'].items()}
         fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
+        fitting = [f'1{u}' if options.displacement_unit else u for u in fitting]
+        way = f'--displacement-unit {next((u for u in fitting if u.endswith("um")), fitting[0])}'
+        cure = f'name the unit of y with --displacement-unit {" or ".join(fitting)}'
+        if split_unit(unit)[0]:
+            way, cure = '', 'is the number before the unit right?'
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
-            f'(1 nm .. 10 mm); name the unit of y with --displacement-unit {" or ".join(fitting)}',
-            options=f'--displacement-unit {"um" if "um" in fitting else fitting[0]}',
+            f'(1 nm .. 10 mm); {cure}',
+            options=way,
         )
     for key, span in moved.items():
         offset = max(map(abs, ranges[key]))
@@ -280,7 +287,7 @@ def _pieces(
         marks = np.union1d(starts, torn).astype(np.int64)
         parts.extend(itertools.pairwise([*marks.tolist(), end]))
     if len(parts) > MANY and t.size < MANY * len(parts):
-        raise _not_uniform(t, parts, name)
+        raise not_uniform(t, len(parts), name)
     if len(parts) > PIECES:
         raise DataError(
             f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
@@ -300,20 +307,12 @@ def _pieces(
     for (start, stop), clock in zip(parts, clocks, strict=True):
         rates[stop - start < FEW].add(clock.sample_rate)
     if len(rates[True] - rates[False]) > MOST_RATES:
-        raise _not_uniform(t, parts, name)
+        raise not_uniform(t, len(parts), name)
     _report_breaks(table, epochs, parts, clocks, met)
     pieces = [_piece(table, p, c) for p, c in zip(parts, clocks, strict=True)]
     if 'y' not in table.columns:
         return tuple(pieces)
     return tuple(part for piece in pieces for part in piece.without(true_runs(np.isnan(piece.y))))
-
-
-def _not_uniform(t: Array, parts: list[tuple[int, int]], name: str) -> DataError:
-    return DataError(
-        f'{name}: time is not uniformly sampled ({len(parts)} breaks in {t.size} samples); if '
-        'the samples came at one rate and none is missing, name it, as in --rate 20e3, and t is '
-        'not read; else write t with more decimals, or resample on a uniform grid'
-    )
 
 
 def _clocks(

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import channel_of_column, role_of
-from piezo_ident.record.options import plain_unit, ReadOptions, UNITS
+from piezo_ident.record.options import name_and_unit, PATH, ReadOptions, split_unit, UNITS
 from piezo_ident.record.record import Fault
 
 _QUANTITIES = {'t': 'time', 'v': 'voltage', 'y': 'displacement'}
@@ -33,15 +33,18 @@ _WORDS = {
     'y': 'y displacement disp position pos weg auslenkung verschiebung deflection elongation '
     'stroke sensor gauge feedback measured',
 }
-#: names of a number beside the columns: the sampling rate, or its inverse
-_RATES = ('fs', 'rate', 'samplerate', 'samplingrate', 'samplefrequency', 'samplingfrequency')
-_PERIODS = ('dt', 'ts', 'deltax', 'deltat', 'sampletime', 'samplingtime', 'wfincrement')
-_UNIT = re.compile(
-    r'(?P<name>.*?)\s*(?:\[(?P<a>[^][]*)\]|\((?P<b>[^()]*)\)|/\s*(?P<c>[^\W\d]+))'
-    r'|(?P<bare>.*?)(?:[_\s.]+|\bin\s+)(?P<d>[^\W\d_]+)'
+#: letters of the name of a number beside the columns: the sampling rate, or its inverse
+_RATES = r'fs|rate|(sampl(e|ing)|scan)(rate|frequency)|samplesper(s|sec|second)'
+_PERIODS = (
+    r'd[tx]|ts|delta[tx]|(sampl(e|ing)|scan)(time|interval|period)|(wf|t|x|time)?incr?(ement)?|'
+    r'timestep|hresolution'
 )
-#: the structs or groups before the name of a column
-_PATH = r'^(\w+\.)+(?=\S)'
+#: of numbers that are likely one of the two, but not surely
+_LIKELY = (
+    '.*(sampl|scan|acqui|record).*(rate|freq|clock).*',
+    'sampling|interval|.*(sampl|scan|acqui|record|time).*(interval|incr|period|step|resol).*',
+)
+_HERTZ = re.compile(r'(|k|M|G)(Hz|Sa?/s)', re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +145,7 @@ def choose(
             fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
         if len(fitting) > 1:
             # v [V] beside v_b [V]
-            bare = [i for i in fitting if _parts(names[i])[0] == role]
+            bare = [i for i in fitting if name_and_unit(names[i])[0] == role]
             fitting = bare if len(bare) == 1 else fitting
         if len(fitting) > 1:
             raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
@@ -154,14 +157,11 @@ def choose(
     known = {*places, *guessed, *('t' if rate is not None else '')}
     missing = [role for role in options.needed if role not in known]
     if missing:
-        raise _missing(missing, names, free, path)
+        raise _missing(missing, names, free, rate_option(scalars or {}), path)
     places |= guessed
     _add_channels(places, free, names, path)
-    units = {role: _unit_of(role, places, names, options, path) for role in 'tvy'}
-    for role in filter(role_of, places):
-        # a unit that the first axis has holds for the others
-        own = _unit_of(role, places, names, options, path)
-        units[role] = own or units[role_of(role)]
+    roles = ('t', 'v', 'y', *filter(role_of, places))
+    units = {role: _unit_of(role, places, names, options, path) for role in roles}
     used = set(places.values())
     faults = []
     if guessed or given or (rate is not None and options.rate is None):
@@ -187,7 +187,7 @@ def _add_channels(
     # of several runs in groups, that of the first axis
     group = next((_group(names[places[role]]) for role in 'vy' if role in places), '')
     for i in free:
-        base = _parts(names[i])[0]
+        base = name_and_unit(names[i])[0]
         is_axis = role_of(base) and _group(names[i]) == group
         role = base if is_axis else names[i]
         if not channel_of_column(role):
@@ -202,11 +202,16 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     """Return the place of a column that is given by name, by name without unit, or by number."""
     low = wanted.strip().casefold()
     is_number = wanted.isdecimal() and 1 <= int(wanted) <= len(names)
+    words = None if is_number else words_of(wanted) or None
+    # channel 1 of an oscilloscope is called 1 [V], and is no first column
+    others = [] if is_number else [name_and_unit(name)[0] for name in names]
     for ways, one in (
         ([*names], wanted),
         ([name.strip().casefold() for name in names], low),
-        # channel 1 of an oscilloscope is called 1 [V], and is no first column
-        ([] if is_number else [_parts(name)[0].casefold() for name in names], low),
+        ([name.casefold() for name in others], low),
+        # run1/ao0 for run1.ao0
+        ([words_of(name) for name in names], words),
+        ([words_of(_group(x) + name) for x, name in zip(names, others, strict=False)], words),
     ):
         here = [i for i, way in enumerate(ways) if way == one]
         if len(here) > 1:
@@ -224,38 +229,27 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     )
 
 
-def _parts(name: str) -> tuple[str, str]:
-    """
-    Return a column's name without its unit, and the unit.
-
-    >>> [_parts(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive voltage')]
-    [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive voltage', '')]
-    """
-    # of a field of a struct, or a channel of a group, its own name
-    name = re.sub(_PATH, '', name.strip())
-    found = _UNIT.fullmatch(name)
-    if not found:
-        return name, ''
-    unit = plain_unit(next((found[k] for k in 'abcd' if found[k] is not None), ''))
-    known = any(unit in units for units in UNITS.values())
-    if found['bare'] is not None:
-        # v_min is no time
-        return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
-    # what stands in square brackets is a unit, known or not
-    return (found['name'], unit) if known or found['a'] is not None else (name, '')
-
-
 def _group(name: str) -> str:
     """Return the struct or group of a column."""
-    found = re.match(_PATH, name)
+    found = re.match(PATH, name)
     return found[0] if found else ''
+
+
+def words_of(name: str) -> tuple[str, ...]:
+    """
+    Return the words of a name, by which other programs write the path to a column.
+
+    >>> words_of("/'Log'/'Strain gauge'"), words_of('out.signals(2).values')
+    (('log', 'strain', 'gauge'), ('out', 'signals', '2', 'values'))
+    """
+    return tuple(re.findall(r'\w+', name.casefold()))
 
 
 def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
     """Return the places of the columns that fit best by their words and units."""
     by_word, by_unit = [], []
     for i, name in columns:
-        base, unit = _parts(name)
+        base, unit = name_and_unit(name)
         measured = next((r for r, units in UNITS.items() if unit in units), None)
         if measured not in (None, role):
             continue
@@ -271,45 +265,83 @@ def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
     return by_word or by_unit
 
 
-def _rate_of(scalars: Mapping[str, float]) -> tuple[float | None, str]:
+def _rate_of(
+    scalars: Mapping[str, float], names: tuple[str, str] = (_RATES, _PERIODS)
+) -> tuple[float | None, str]:
     """Return the sampling rate among some numbers, and its name."""
     for name, value in scalars.items():
-        base, unit = _parts(name)
+        # a unit that is none of `UNITS` counts in square brackets
+        base, unit = name_and_unit(re.sub(r'\((\w[^()]*)\)\s*$', r'[\1]', name))
         base = re.sub(r'[^a-z]', '', base.casefold())
         if not (value > 0 and np.isfinite(value)):
             continue
-        if base in _RATES and unit in ('', 'Hz', 'kHz'):
-            return value * (1e3 if unit == 'kHz' else 1.0), name
-        if base in _PERIODS and unit in ('', *UNITS['t']):
+        hertz = _HERTZ.fullmatch(unit or 'Hz')
+        if hertz and re.fullmatch(names[0], base):
+            return value * {'': 1.0, 'k': 1e3, 'm': 1e6, 'g': 1e9}[hertz[1].lower()], name
+        if unit in ('', *UNITS['t']) and re.fullmatch(names[1], base):
             return UNITS['t'][unit or 's'] / value, name
     return None, ''
+
+
+def rate_option(scalars: Mapping[str, float]) -> str:
+    """
+    Return an option with a sampling rate: of what is likely one among some numbers, or any.
+
+    >>> rate_option({'Recording step [ms]': 0.5}), rate_option({'Trigger [V]': 0.5})
+    ('--rate 2000', '--rate 20e3')
+    """
+    rate = _rate_of(scalars)[0] or _rate_of(scalars, _LIKELY)[0]
+    return f'--rate {rate:.9g}' if rate else '--rate 20e3'
 
 
 def _unit_of(
     role: str, places: Mapping[str, int], names: Sequence[str], options: ReadOptions, path: Path
 ) -> str:
-    own, role = role, role_of(role) or role
-    given = options.unit(role)
-    if given or own not in places or names[places[own]] == own:
-        return given or ''
-    name = names[places[own]]
-    _, unit = _parts(name)
-    if unit and unit not in UNITS[role]:
-        quantity = _QUANTITIES[role]
-        kind = next((q for r, q in _QUANTITIES.items() if unit in UNITS[r]), None)
-        way = f'--{quantity}-unit {[*UNITS[role]][-2]}'
-        scale = f'--{quantity}-unit 10{[*UNITS[role]][-2]}'
-        raise DataError(
-            f'{path}: {listed([name])} is to be the {quantity}, '
-            + (
-                f'but its unit is of a {kind}; name another column, or what one {unit} is, as in '
-                f'{scale}'
-                if kind
-                else f'whose unit {unit!r} is unknown; name another column, or its unit: {way}'
-            ),
-            options='' if kind else way,
+    """Return what one of a column is, by its header and the option; empty where neither says."""
+    first = role_of(role) or role
+    # a unit that the first axis has holds for the others
+    own = [names[places[r]] for r in (role, first) if r in places]
+    name = next((x for x in own if name_and_unit(x)[1]), '')
+    unit, given = name_and_unit(name)[1], options.unit(first) or ''
+    kind = next((r for r, units in UNITS.items() if unit in units), None)
+    number, plain, of_volts = split_unit(given)
+    if not unit or (given and not kind):
+        return given
+    if number and kind == 'v' and plain != unit:
+        # of one volt, whatever the header counts in
+        return f'{float(number) / UNITS["v"][unit]:.15g}{plain}'
+    if number and (kind == 'v' or not of_volts):
+        return given
+    # an axis whose header has a unit of its own keeps it
+    if kind == first and (given in ('', unit) or (role != first and not number)):
+        return unit
+    raise _contradiction(first, kind, name, unit, given, path)
+
+
+def _contradiction(
+    role: str, kind: str | None, name: str, unit: str, given: str, path: Path
+) -> DataError:
+    """Return the error for a header whose unit is none of a quantity, or not the given one."""
+    option = f'--{_QUANTITIES[role]}-unit'
+    common = [*UNITS[role]][-2]
+    column = f'{path}: {listed([name])} is to be the {_QUANTITIES[role]}, '
+    if kind is None:
+        way = f'{option} {common}'
+        return DataError(
+            f'{column}whose unit {unit!r} is unknown; name another column, or its unit: {way}',
+            options=way,
         )
-    return unit
+    if kind != role:
+        one, scale = ('V', f'10{common}/V') if kind == 'v' else (unit, f'10{common}')
+        return DataError(
+            f'{column}but its unit is of a {_QUANTITIES[kind]}; name another column, or what one '
+            f'{one} is, as in {option} {scale}'
+        )
+    _, plain, of_volts = split_unit(given)
+    # of one volt, as many as the header counts in it
+    way = f'{option} {UNITS["v"].get(unit, 1.0):g}{plain}'
+    cure = 'leave the option out' if of_volts else f'leave the option out, or overrule it by {way}'
+    return DataError(f'{column}in {unit} by the header, and {option} says {given}; {cure}')
 
 
 def _option(role: str, name: str) -> str:
@@ -334,12 +366,14 @@ def _said(role: str, place: int, names: Sequence[str], unit: str) -> str:
     return f'{role} is {name} {known}'
 
 
-def _missing(missing: list[str], names: Sequence[str], free: list[int], path: Path) -> DataError:
-    # time is the example for nothing else
-    fit = [i for i in free if 't' in missing or _parts(names[i])[1] not in UNITS['t']] or free
+def _missing(
+    missing: list[str], names: Sequence[str], free: list[int], rate: str, path: Path
+) -> DataError:
+    # time, and what is counted, are the example for nothing else
+    likely = ('', *UNITS['v'], *UNITS['y'])
+    fit = [i for i in free if 't' in missing or name_and_unit(names[i])[1] in likely] or free
     ways = [names[i] or str(i + 1) for i in fit]
     found = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
-    rate = '--rate 20e3'
     further = ''
     if missing == ['t']:
         further = f', or the column of time: {_option("t", ways[0])}' if ways else ''

@@ -128,7 +128,9 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         (table.names, table.starts),
         {channel_of_column(name): x for name, x in columns.items()},
         name=str(path),
-        options=replace(options, displacement_unit=table.units.get('y')),
+        options=replace(
+            options, displacement_unit=table.units.get('y'), time_unit=table.units.get('t')
+        ),
         faults=[
             *table.faults,
             *(Fault('ignored_column', repr(c), 1, 'not read') for c in table.ignored),
@@ -148,7 +150,10 @@ def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterato
     if table.rate is not None and not SLOW < table.rate <= FAST:
         kind = 'slow' if table.rate <= SLOW else 'fast'
         where = f'sampled at {table.rate:.6g} Hz, unusual for a stage'
-        yield Fault(f'{kind}_sampling', where, 1, 'is it in Hz? else give it as in --rate 20e3')
+        # one that the file names may be counted in another unit
+        other = f'{table.rate * (1e3 if kind == "slow" else 1e-3):.9g}'
+        way = f'--rate {other if options.rate is None else "20e3"}'
+        yield Fault(f'{kind}_sampling', where, 1, f'is it in Hz? else give it as in {way}')
     elif table.rate is None and options.time_unit is None:
         unit = table.units.get('t', 's')
         finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
@@ -158,6 +163,8 @@ def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterato
         ):
             if is_odd:
                 where = f'sampled at {rate:.6g} Hz with t in {unit}, unusual for a stage'
+                # a unit without a number must not contradict the header
+                other = f'1{other}' if other and 't' in table.units else other
                 cure = 'is the time unit right?' + (other and f' else add --time-unit {other}')
                 yield Fault(f'{kind}_sampling', where, 1, cure)
     if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:

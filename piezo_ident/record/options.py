@@ -32,8 +32,9 @@ class ReadOptions:
     ----------
     displacement_unit : {'m', 'mm', 'um', 'nm'}, optional
         Unit of the displacement in the file; by default what the header says, else m.  With a
-        number before it, what one of the file is: ``'10um'`` of a sensor of 10 um/V.  So are the
-        other units: ``'20V'`` of a monitor that shows a twentieth.
+        number before it, what one of the file is: ``'10um/V'`` of a sensor's volts.  So are the
+        other units: ``'20V'`` of a monitor that shows a twentieth.  Where the header names mV, a
+        number still belongs to one volt; a unit without a number must be that of the header.
     voltage_limits : tuple of float, optional
         Smallest and largest voltage [V] that may occur.
     namespace, voltage_topic, displacement_topic : str, optional
@@ -142,35 +143,75 @@ def scaled_unit(role: str, text: str) -> str:
     """
     Return a unit of ``t``, ``v`` or ``y`` with the letters of `UNITS`; empty for none.
 
-    A number before it says what one of the file is.
+    A number before it says what one of the file is, or one volt.
 
-    >>> scaled_unit('y', ' 10 micron/V'), scaled_unit('v', '20V'), scaled_unit('y', '0um')
-    ('10um', '20V', '')
+    >>> scaled_unit('y', ' 10 micron/V'), scaled_unit('y', 'um/V'), scaled_unit('v', '20V')
+    ('10um/V', '1um/V', '20V')
+    >>> scaled_unit('y', '0um')
+    ''
     """
-    found = _SCALED.fullmatch(text.strip().removesuffix('/V'))
-    if not found or plain_unit(found[2]) not in UNITS[role]:
+    number, unit, of_volts = split_unit(text)
+    if unit not in UNITS[role] or (of_volts and role == 't'):
         return ''
-    if found[1] and not SMALL < float(found[1]) < 1.0 / SMALL:
+    if number and not SMALL < float(number) < 1.0 / SMALL:
         return ''
-    return found[1] + plain_unit(found[2])
+    return f'{number or "1"}{unit}/V' if of_volts else number + unit
+
+
+def split_unit(text: str) -> tuple[str, str, bool]:
+    """
+    Return the number before a unit, the unit with the letters of `UNITS`, and whether /V follows.
+
+    >>> split_unit('10 \u00b5m/V'), split_unit('sec'), split_unit('')
+    (('10', 'um', True), ('', 's', False), ('', '', False))
+    """
+    found = _SCALED.fullmatch(text.strip())
+    return (found[1], plain_unit(found[2]), bool(found[3])) if found else ('', '', False)
 
 
 def unit_factor(role: str, unit: str) -> float:
     """
     Return how many of a unit from `scaled_unit` make one of SI; 1 where none is named.
 
-    >>> unit_factor('y', '10um'), unit_factor('v', 'mV')
+    >>> unit_factor('y', '10um/V'), unit_factor('v', 'mV')
     (100000.0, 1000.0)
     """
-    found = _SCALED.fullmatch(unit)
-    known = UNITS.get(role, {})
-    return known.get(found[2], 1.0) / float(found[1] or 1.0) if found else 1.0
+    number, plain, _ = split_unit(unit)
+    return UNITS.get(role, {}).get(plain, 1.0) / float(number or 1.0)
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """
+    Return a column's name without its unit, and the unit.
+
+    >>> [name_and_unit(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive')]
+    [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive', '')]
+    """
+    # of a field of a struct, or a channel of a group, its own name
+    name = re.sub(PATH, '', name.strip())
+    found = _NAMED.fullmatch(name)
+    if not found:
+        return name, ''
+    unit = plain_unit(next((found[k] for k in 'abcd' if found[k] is not None), ''))
+    known = any(unit in units for units in UNITS.values())
+    if found['bare'] is not None:
+        # v_min is no time
+        return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
+    # what stands in square brackets is a unit, known or not
+    return (found['name'], unit) if known or found['a'] is not None else (name, '')
 
 
 #: least number before a unit, and the inverse of the largest
 SMALL = 1e-12
-#: a unit, and a number before it
-_SCALED = re.compile(r'\s*(\d*\.?\d+(?:e[-+]?\d+)?|)\s*(\D+)', re.IGNORECASE)
+#: a unit, a number before it, and volts below it
+_SCALED = re.compile(r'(\d*\.?\d+(?:e[-+]?\d+)?|)\s*([^\d/]+?)\s*(/\s*V)?', re.IGNORECASE)
+#: a name with its unit
+_NAMED = re.compile(
+    r'(?P<name>.*?)\s*(?:\[(?P<a>[^][]*)\]|\((?P<b>[^()]*)\)|/\s*(?P<c>[^\W\d]+))'
+    r'|(?P<bare>.*?)(?:[_\s.]+|\bin\s+)(?P<d>[^\W\d_]+)'
+)
+#: the structs or groups before the name of a column
+PATH = r'^(\w+\.)+(?=\S)'
 _SPELT = {
     **dict.fromkeys(('sec', 'secs', 'second', 'seconds', 'sekunden'), 's'),
     **dict.fromkeys(('msec', 'millisecond', 'milliseconds'), 'ms'),

@@ -122,7 +122,7 @@ def _stretches(
                 at = t[start:overlap][same_time][0]
                 raise DataError(
                     f'{name}: two different samples at t = {at:.9g} s; write t with more '
-                    'decimals, keep one of them, or give the rate: --rate 20e3'
+                    f'decimals, keep one of them, or give the exact rate: {_mean_rate(t)}'
                 )
             else:
                 raise DataError(
@@ -140,6 +140,20 @@ def _stretches(
         epochs,
         np.concatenate(repeated) if repeated else t[:0],
     )
+
+
+def not_uniform(t: Array, breaks: int, name: str) -> DataError:
+    """Return the error for times that do not belong to a sampling clock."""
+    return DataError(
+        f'{name}: time is not uniformly sampled ({breaks} breaks in {t.size} samples); if the '
+        f'samples came at one rate and none is missing, name it, as in {_mean_rate(t)}, and t is '
+        'not read; else write t with more decimals, or resample on a uniform grid'
+    )
+
+
+def _mean_rate(t: Array) -> str:
+    span = float(np.ptp(t))
+    return f'--rate {(t.size - 1) / span:.6g}' if span > 0.0 else '--rate 20e3'
 
 
 def at_times(times: Array) -> str:

@@ -22,11 +22,14 @@ COMMENT = ('#', '%', '//', '!')
 
 _DIGITS = r'[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][-+]?\d+)?'
 _NUMBER = re.compile(rf'{_DIGITS}|[-+]?(nan|inf)', re.IGNORECASE | re.ASCII)
-#: a number that stands alone behind its name
-_ALONE = re.compile(
-    rf'\W*(?P<name>.+?)\s*[:=,;\t]+\s*(?P<value>{_DIGITS})(\s*(?P<unit>[^\W\d]+))?(\W.*)?'
+#: a number that stands alone behind its name, with its unit or a cell that may be one
+_ALONE = (
+    r'\W*(?P<name>.+?)\s*[:=,;\t]+\s*(?P<value>{})'
+    r'(\s*(?P<unit>[^\W\d]+(/s)?)|\s*[,;\t]\s*(?P<cell>[^\W\d]+(/s)?))?(\W.*)?'
 )
 _LVM_UNITS = 'Y_Unit_Label'
+#: in a line of units; Rigol's oscilloscopes name that of counted samples
+_OTHER_UNITS = ('', '-', 'Hz', 'kHz', 'MHz', 'S/s', 'Sa/s', 'N', 'A', 'K', 'Sequence')
 #: None: blanks
 _SEPARATORS = ('\t', ';', ',', None)
 
@@ -90,7 +93,7 @@ def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
             below = cells_of(next((lines[i] for i in filled if i > first), ''), separator)
             if any(below) and all(map(_is_unit, below)):
                 return None  # a second line of it
-            return Layout(separator, tuple(cells), first + 1)
+            return Layout(separator, tuple(_as_wide(cells, below)), first + 1)
     return None
 
 
@@ -125,7 +128,8 @@ def _above(
         cells = _named(line, separator, need)
         if not cells:
             break
-        if not units and all(_is_unit(cell) for cell in cells if cell):
+        known = all(_is_unit(x) or is_number(x) for x in cells)
+        if not units and known and not all(map(is_number, cells)):
             units = cells
             continue
         names = cells
@@ -136,20 +140,40 @@ def _above(
         # LabVIEW lists the units of its columns far above them
         rows = [cells_of(lines[i], separator) for i in filled if lines[i].startswith(_LVM_UNITS)]
         units = ['', *rows[-1][1:]] if rows else []
-    names = [
-        f'{name} [{unit.strip("[]()")}]' if unit and name else name
-        for name, unit in zip(names, [*units, *[''] * len(names)], strict=False)
-    ]
-    numbers = {}
-    for i in filled:
-        found = _ALONE.fullmatch(lines[i].strip())
-        if found:
-            name = f'{found["name"]} [{found["unit"]}]' if found['unit'] else found['name']
-            numbers[name] = float(found['value'].replace(',', '.'))
     # a column that is empty, as LabVIEW writes time that it does not know; not a cell that is
     some = [cells_of(line, separator) for line in lines[first : first + 100]]
-    empty = tuple(j for j in range(need) if not any(''.join(cells[j : j + 1]) for cells in some))
-    return Layout(separator, tuple(names), first, numbers, empty, len(row))
+    width = max(len(row), len(names))
+    empty = {j for j in range(width) if not any(''.join(cells[j : j + 1]) for cells in some)}
+    numbers = dict(filter(None, (_alone(lines[i], separator) for i in filled)))
+    for j, (name, unit) in enumerate(zip(names, [*units, *[''] * len(names)], strict=False)):
+        # what oscilloscopes write once, above no column: Increment over 1e-3, or tInc = 1e-3
+        found = _alone(f'{name}={unit}' if is_number(unit) else name, separator)
+        if found and j in empty:
+            numbers |= [found]
+            names[j] = ''
+        elif unit and name:
+            names[j] = f'{name} [{unit.strip("[]()")}]'
+    names = _as_wide(names, row)
+    return Layout(separator, tuple(names), first, numbers, tuple(empty), len(row))
+
+
+def _as_wide(names: list[str], row: Sequence[str]) -> list[str]:
+    """Return names without empty ones that no cell of a row has, or with some for empty cells."""
+    while len(names) > len(row) and not names[-1]:
+        names = names[:-1]
+    more = row[len(names) :]
+    return names if any(more) or not names else [*names, *more]
+
+
+def _alone(line: str, separator: str | None) -> tuple[str, float] | None:
+    """Return the name, with its unit, and the number that stands alone in a line."""
+    digits = _DIGITS.replace('[.,]', '[.]') if separator == ',' else _DIGITS
+    found = re.fullmatch(_ALONE.format(digits), line.strip().replace('"', ''))
+    if not found:
+        return None
+    unit = found['unit'] or (found['cell'] if _is_unit(found['cell'] or '') else '')
+    name = f'{found["name"]} [{unit}]' if unit else found['name']
+    return name, float(found['value'].replace(',', '.'))
 
 
 def _named(line: str, separator: str | None, need: int) -> list[str]:
@@ -166,4 +190,4 @@ def _named(line: str, separator: str | None, need: int) -> list[str]:
 
 def _is_unit(text: str) -> bool:
     unit = plain_unit(text.strip().strip('[]()'))
-    return unit in ('', '-', 'Hz', 'N', 'A', 'K') or any(unit in units for units in UNITS.values())
+    return unit in _OTHER_UNITS or any(unit in units for units in UNITS.values())

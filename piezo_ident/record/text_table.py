@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.assemble import label_runs
-from piezo_ident.record.columns import choose, RecordTable
+from piezo_ident.record.columns import choose, rate_option, RecordTable
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.tables import Blocks, ROWS
 from piezo_ident.record.text_layout import COMMENT, find_layout, is_number, Layout
@@ -75,7 +75,9 @@ def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTabl
         )
     names = layout.names
     if not names and not options.columns:
-        way = '--columns ' + ('t=1,v=2,y=3' if layout.width > 2 else 'v=1,y=2 --rate 20e3')
+        rate = rate_option(layout.numbers)
+        filled = layout.width - len(layout.empty)
+        way = '--columns ' + ('t=1,v=2,y=3' if filled > 2 else f'v=1,y=2 {rate}')
         raise DataError(
             f'{path}: no header line; say which column is which by their numbers (of '
             f'{layout.width}): {way}',
@@ -237,7 +239,7 @@ def _culprit(
             if not is_number(text):
                 below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]
                 if number == layout.above + 1 and below and not any(map(is_number, below)):
-                    return _all_text(f'{path}: column {title}', text, name)
+                    return _all_text(f'{path}: column {title}', text, name, layout)
                 grouped = re.fullmatch(r'[-+]?\d{1,3}([.,]\d{3})+([.,]\d*)?', text)
                 cure = (
                     'save it without marks between thousands'
@@ -254,8 +256,8 @@ def _culprit(
     return DataError(f'{path}: unreadable rows from line {line}; save it again')
 
 
-def _all_text(column: str, text: str, name: str) -> DataError:
-    way = '--rate 20e3' if name == 't' else f'--columns {name}=NAME'
+def _all_text(column: str, text: str, name: str, layout: Layout) -> DataError:
+    way = rate_option(layout.numbers) if name == 't' else f'--columns {name}=NAME'
     cure = 'give the sampling rate instead' if name == 't' else 'name another column'
     return DataError(
         f'{column} holds text, {text[:40]!r}, no numbers; {cure}, as in {way}',

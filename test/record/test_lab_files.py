@@ -3,6 +3,7 @@
 
 """A lab's own files are read as they are; what cannot be known is asked for in one line."""
 
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 import shlex
@@ -11,8 +12,10 @@ import sys
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main
+from piezo_ident.cli.console import Console
 from piezo_ident.cli.identify_command import prompt_of
 from piezo_ident.cli.main import cli
+from piezo_ident.cli.records import read_all, spans
 from piezo_ident.common.errors import DataError
 import pytest
 import scipy.io
@@ -353,10 +356,11 @@ def test_volts_of_a_sensor_and_of_a_monitor(tmp_path, capsys):
 @pytest.mark.parametrize(
     ('header', 'rate', 'kind', 'cure'),
     [
-        ('time_s', 2.0, 'slow', '--time-unit ms'),
-        ('t [ms]', 0.002, 'slow', '--time-unit us'),
+        ('time', 2.0, 'slow', '--time-unit ms'),
+        ('time_s', 2.0, 'slow', '--time-unit 1ms'),
+        ('t [ms]', 0.002, 'slow', '--time-unit 1us'),
         ('time_s', 2e6, 'fast', 'is the time unit right?'),
-        ('time_ms', 5e3, 'fast', '--time-unit s'),
+        ('time_ms', 5e3, 'fast', '--time-unit 1s'),
     ],
 )
 def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, cure):
@@ -366,6 +370,8 @@ def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, 
     assert cure in doubts[f'{kind}_sampling']
     assert main(['convert', str(path), str(tmp_path / 'o.npz')]) == 0
     assert cure in capsys.readouterr().err
+    if cure.startswith('--'):
+        assert main(['convert', str(path), str(tmp_path / 'p.npz'), *cure.split()]) == 0
 
 
 @pytest.mark.parametrize(
@@ -387,7 +393,7 @@ def test_a_slip_of_a_thousand_is_said(tmp_path, capsys, header, options, kind, c
 def test_time_that_is_rounded_is_not_guessed_where_two_rates_fit(tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text('t,v,y\n' + rows(np.round(K / 4967.3, 3), V, 1e-6 * UM))
-    with pytest.raises(DataError, match=r'two different samples.*--rate 20e3'):
+    with pytest.raises(DataError, match=r'two different samples.*--rate 496\d'):
         pi.read(path)
     assert pi.read(path, rate=4967.3).pieces[0].sample_rate == 4967.3
 
@@ -481,3 +487,222 @@ def test_damaged_files(tmp_path, suffix):
         with pytest.raises(DataError) as caught:
             pi.read(path)
         assert str(caught.value).isprintable()
+
+
+# --- units of headers and options -----------------------------------------------------------
+
+
+def scope_csv_of(path: Path, names: dict) -> None:
+    path.write_text(','.join(names) + '\n' + rows(*names.values()))
+
+
+def scope_npz(path: Path, names: dict) -> None:
+    np.savez(path, **names)
+
+
+def scope_mat(path: Path, names: dict) -> None:
+    scipy.io.savemat(path, {'run': names})
+
+
+def scope_h5(path: Path, names: dict) -> None:
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(path, 'w') as file:
+        for name, x in names.items():
+            base, unit = name.split('_')
+            file[f'run/{base}'] = x
+            file[f'run/{base}'].attrs['Units'] = np.array([unit.encode()])
+
+
+def scope_tdms(path: Path, names: dict) -> None:
+    tdms = pytest.importorskip('nptdms')
+    with tdms.TdmsWriter(path) as writer:
+        for name, x in names.items():
+            base, unit = name.split('_')
+            writer.write_segment([tdms.ChannelObject('run', base, x, {'unit_string': unit})])
+
+
+SCOPE = {'csv': scope_csv_of, 'npz': scope_npz, 'mat': scope_mat, 'h5': scope_h5}
+SCOPE['tdms'] = scope_tdms
+
+
+@pytest.mark.parametrize('suffix', SCOPE)
+def test_units_are_judged_the_same_way_in_every_format(tmp_path, suffix):
+    k = np.arange(300)
+    v = 5.0 - 5.0 * np.cos(0.1 * k)
+    path = tmp_path / f'scope.{suffix}'
+    # a sensor of 0.1 V at full stroke, in mV, and a voltage in kV
+    SCOPE[suffix](path, {'time_ms': 1.0 * k, 'drive_kV': 1e-3 * v, 'B_mV': 10.0 * v})
+    number = {'csv': 'B_mV', 'npz': 'B_mV', 'mat': 'run.B_mV', 'h5': 'run/B', 'tdms': 'run/B'}
+    columns = {'y': number[suffix]}
+    (piece,) = pi.read(path, columns=columns, displacement_unit='10um/V').pieces
+    assert piece.sample_rate == 1000.0
+    np.testing.assert_allclose(piece.v, v, rtol=1e-9)
+    np.testing.assert_allclose(piece.y, 1e-7 * v, rtol=1e-9)
+    with pytest.raises(DataError, match=r'unit is of a voltage.*--displacement-unit 10um/V'):
+        pi.read(path, columns=columns, displacement_unit='um')
+
+
+@pytest.mark.parametrize(
+    ('header', 'choices', 'v_by', 'y_by'),
+    [
+        # a factor is of one volt, whatever the header counts in
+        ('t,drive [V],B [mV]', {'displacement_unit': '1um/V'}, 1.0, 1e-9),
+        ('t,drive [V],B [mV]', {'displacement_unit': '1um'}, 1.0, 1e-9),
+        ('t,drive [mV],B [mV]', {'displacement_unit': 'um/V', 'voltage_unit': '20V'}, 0.02, 1e-9),
+        ('t,drive [kV],B [V]', {'displacement_unit': '1um/V', 'voltage_unit': '20V'}, 2e4, 1e-6),
+        # of the unit in the header, where it is the same
+        ('t,drive [mV],B [um]', {'voltage_unit': '20mV'}, 0.02, 1e-6),
+        # a plain unit that the header has, or that nobody contradicts
+        ('t,drive [mV],B [um]', {'displacement_unit': 'um', 'voltage_unit': 'mV'}, 1e-3, 1e-6),
+        ('t,drive,B [a.u.]', {'displacement_unit': 'um', 'voltage_unit': 'mV'}, 1e-3, 1e-6),
+        # a number overrules a header that is wrong
+        ('t,drive [V],B [um]', {'displacement_unit': '1nm', 'voltage_unit': '1mV'}, 1e-3, 1e-9),
+        ('t,drive [mV],B [um]', {'voltage_unit': '1000V'}, 1.0, 1e-6),
+    ],
+)
+def test_units_of_header_and_option(tmp_path, header, choices, v_by, y_by):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'{header}\n{rows(K / RATE, V, UM)}')
+    (piece,) = pi.read(path, columns='v=2,y=3', **choices).pieces
+    np.testing.assert_allclose(piece.v, v_by * V, rtol=1e-12)
+    np.testing.assert_allclose(piece.y, y_by * UM, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('header', 'choices', 'words'),
+    [
+        ('t,drive [mV],B [um]', '--voltage-unit V', ['drive [mV]', '--voltage-unit 1000V']),
+        ('t,drive [V],B [um]', '--voltage-unit mV', ['drive [V]', '--voltage-unit 1mV']),
+        ('t,drive [V],B [um]', '--displacement-unit nm', ['B [um]', '--displacement-unit 1nm']),
+        ('t,drive [V],B [um]', '--displacement-unit 10um/V', ['B [um]', 'leave the option out']),
+        ('t [ms],drive [V],B [um]', '--time-unit s', ['t [ms]', '--time-unit 1s']),
+    ],
+)
+def test_a_unit_that_the_header_contradicts_is_asked_about(
+    tmp_path, capsys, header, choices, words
+):
+    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
+    path.write_text(f'{header}\n{rows(K / RATE, V, UM)}')
+    argv = ['convert', str(path), out, '--columns', 'v=2,y=3']
+    assert main([*argv, *choices.split()]) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in (str(path), choices.split()[0], *words)), said
+    # what overrules the header is typed
+    if words[1].startswith('--'):
+        assert main([*argv, *words[1].split()]) == 0
+
+
+def test_an_axis_keeps_the_unit_of_its_own_header(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text(f't,v [mV],y,v_b,y_b [nm]\n{rows(K / RATE, V, UM, V, UM)}')
+    (piece,) = pi.read(path, displacement_unit='um', voltage_unit='20V').pieces
+    np.testing.assert_allclose(piece.channels['v_b'], piece.v, rtol=1e-12)
+    np.testing.assert_allclose(1e3 * piece.channels['y_b'], piece.y, rtol=1e-12)
+
+
+def test_what_the_units_make_of_the_numbers_is_printed(tmp_path, capsys):
+    names = 'Time,Channel A,Channel B\n(ms),(V),(mV)\n\n'
+    v = 5.0 - 5.0 * np.cos(0.1 * np.arange(300))
+    paths = [tmp_path / name for name in ('a.csv', 'b.csv')]
+    for i, path in enumerate(paths, 1):
+        path.write_text(names + rows(np.arange(300.0), v, 100.0 * i * v))
+    given = ['--columns', 'v=2,y=3', '--displacement-unit', '1um/V']
+    assert main(['convert', *given, str(paths[0]), str(tmp_path / 'o.npz')]) == 0
+    printed = capsys.readouterr()
+    for text in (printed.err, printed.out):
+        assert 'stroke 1 um' in text and 'voltage 0 to 10 V' in text
+    args = cli.main(['identify', *given, *map(str, paths)], standalone_mode=False)
+    both = read_all(paths, args, Console())
+    assert 'a.csv and 1 more' in (said := capsys.readouterr().err) and 'stroke 1 to 2 um' in said
+    # of a motion that is wanted no voltage is known
+    unknown = [replace(p, v=np.full(p.n, np.nan)) for p in both[0]]
+    assert spans([replace(both[0], pieces=tuple(unknown))]) == 'stroke 1 um'
+
+
+def test_a_stroke_that_is_none_brings_a_unit_that_is_taken(tmp_path, capsys):
+    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
+    path.write_text(f't [s],drive [V],pos [mm]\n{rows(K / RATE, V, UM)}')
+    assert main(['convert', str(path), out]) == 2
+    shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
+    assert main(shlex.split(shown)) == 0
+    np.testing.assert_allclose(pi.read(out).pieces[0].y, 1e-6 * UM, rtol=1e-12)
+    # a number that somebody gave is not answered by the same again
+    with pytest.raises(DataError, match='number before the unit') as caught:
+        pi.read(path, displacement_unit='1m')
+    assert not caught.value.options
+    path.write_text(f't [s],drive [V],pos [um]\n{rows(1e12 + K, V, UM)}')
+    with pytest.raises(DataError, match='--time-unit 1ms'):
+        pi.read(path)
+
+
+# --- the sampling rate in a header ----------------------------------------------------------
+
+
+def test_an_oscilloscope_with_the_increment_in_its_header(tmp_path, capsys):
+    path, out = tmp_path / 'rigol.csv', str(tmp_path / 'o.npz')
+    table = rows(K, V, UM / 10).replace('\n', ',\n')
+    path.write_text(f'X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.0e-01,2.0e-04\n{table}')
+    given = []
+    for said in ("--columns 'v=CH1 [Volt]'", "--columns 'y=CH2 [Volt]'"):
+        # each line asks for what is missing, as it is typed
+        assert main(['convert', str(path), out, *given]) == 2
+        assert said in capsys.readouterr().err
+        given += shlex.split(said)
+    assert main(['convert', str(path), out, *given, '--displacement-unit', '10um/V']) == 0
+    (piece,) = pi.read(out).pieces
+    assert piece.sample_rate == RATE
+    np.testing.assert_array_equal(piece.v, V)
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('head', 'end'),
+    [
+        ('CH1 (V),CH2 (um),t0 = -0.1, tInc = 2.0e-04,', ',,'),
+        ('CH1 (V),CH2 (um),,', ',,'),
+        ('Sample interval,0.2,ms\nCH1 (V),CH2 (um)', ''),
+        ('"Sampling time","200 us"\n"CH1 (V)","CH2 (um)"', ''),
+        ('Sampling rate,5000,5000\nCH1 (V),CH2 (um),', ''),
+        ('Sample rate (kS/s): 5\nCH1 (V),CH2 (um)', ','),
+        ('HResolution,2.0e-04\nCH1 (V),CH2 (um)', ''),
+    ],
+)
+def test_a_sample_time_above_the_table(tmp_path, head, end):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'{head}\n' + rows(V, UM).replace('\n', f'{end}\n'))
+    options = {} if any(x in head for x in '=:') or '\n' in head else {'rate': RATE}
+    (piece,) = pi.read(path, **options).pieces
+    assert piece.sample_rate == RATE
+    np.testing.assert_array_equal(piece.v, V)
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
+def test_a_trailing_comma_in_the_rows_alone(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text('t,v,y\n' + rows(K / RATE, V, 1e-6 * UM).replace('\n', ',\n'))
+    np.testing.assert_array_equal(pi.read(path).pieces[0].v, V)
+
+
+@pytest.mark.parametrize(
+    'head',
+    [
+        'Recording interval: 0.2 ms\nCH1 (V),CH2 (um)',
+        'Recording interval: 0.2 ms',
+        'Recording interval: 0.2 ms\nTime,CH1 (V),CH2 (um)',
+    ],
+)
+def test_a_rate_that_is_suggested_is_the_one_in_the_file(tmp_path, capsys, head):
+    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
+    columns = (V, UM) if 'Time' not in head else (np.array(['now'] * N), V, UM)
+    path.write_text(f'{head}\n{rows(*columns)}')
+    assert main(['convert', str(path), out]) == 2
+    shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
+    assert main([*shlex.split(shown), '--displacement-unit', 'um']) == 0
+    assert pi.read(out).pieces[0].sample_rate == RATE
+
+
+def test_a_slip_in_the_unit_of_a_sample_time_is_said(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text(f'Sample interval: 0.2\nCH1 (V),CH2 (um)\n{rows(V, UM)}')
+    (fault,) = (f for f in pi.read(path).faults if f.name == 'slow_sampling')
+    assert fault.action.endswith('--rate 5000')
