@@ -11,7 +11,7 @@ of numbers are looked at, and `piezo_ident.record.columns` tells which is which.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 import importlib
@@ -25,7 +25,7 @@ import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import UNPACKED_SIZE
 from piezo_ident.record.assemble import label_runs
-from piezo_ident.record.columns import choose, RecordTable
+from piezo_ident.record.columns import choose, RecordTable, words_of
 from piezo_ident.record.mat_read import flat, read_variables
 from piezo_ident.record.options import ReadOptions
 
@@ -64,13 +64,13 @@ def read_mat(path: Path, options: ReadOptions) -> RecordTable:
         return read_hdf5(path, options)
     with _damage(path, 'MATLAB file', 'save it again with save -v7'):
         needed = None if options.columns else options.needed
-        names, arrays = read_variables(path, _USED, needed)
-    return _table(arrays, names, path, options)
+        names, arrays, paths = read_variables(path, _USED, needed)
+    return _table(arrays, names, path, _renamed(options, paths.items(), arrays))
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
     """Read an HDF5 file, MATLAB's version 7.3 among them."""
-    h5py = _library('h5py', path)
+    h5py = library('h5py', path)
     arrays: dict[str, Any] = {}
     size = 0
 
@@ -83,16 +83,17 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
         if not isinstance(node, h5py.Dataset) or name.startswith('#'):
             return
         key, kind = name.replace('/', '.'), node.attrs.get('MATLAB_class', b'')
-        unit = node.attrs.get('unit', node.attrs.get('units', ''))
+        units = [np.ravel(x) for k, x in node.attrs.items() if k.lower() in ('unit', 'units')]
+        unit = units[0][0] if units and units[0].size else ''
         text = unit.decode(errors='replace') if isinstance(unit, bytes) else unit
         if key == 'segment_name':
             arrays[key] = _texts(node, kind)
         elif kind != b'char' and (node.dtype.kind in 'biuf' or node.dtype.names):
             size += node.nbytes
             _check_size(size)
-            if isinstance(text, str) and text:
-                key = f'{key} [{text}]'
-            arrays.update({key: node[()]} if key in _LABELS else flat(key, node[()]))
+            end = f' [{text}]' if isinstance(text, str) and text else ''
+            parts = {key: node[()]} if key in _LABELS else dict(flat(key, node[()]))
+            arrays.update({name + end: x for name, x in parts.items()})
 
     with (
         _damage(path, 'HDF5 file', 'save it again; MATLAB: save -v7'),
@@ -111,9 +112,10 @@ def _texts(node: Any, kind: bytes) -> Any:
 
 def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
     """Read a file of LabVIEW's TDMS."""
-    tdms = _library('nptdms', path, 'npTDMS')
+    tdms = library('nptdms', path, 'npTDMS')
     arrays: dict[str, Any] = {}
     periods: dict[str, float] = {}
+    paths: list[tuple[str, str]] = []
     with _damage(path, 'TDMS file', 'write it again'), tdms.TdmsFile.open(path) as file:
         channels = [channel for group in file.groups() for channel in group.channels()]
         counts = Counter(channel.name for channel in channels)
@@ -124,6 +126,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
                 name = f'{channel.group_name}.{name}'
             unit = str(channel.properties.get('unit_string', ''))
             name = f'{name} [{unit}]' if unit else name
+            paths.append((f'{channel.group_name}/{channel.name}', name))
             arrays[name] = channel[:]
             if 'wf_increment' in channel.properties:
                 periods[name] = float(channel.properties['wf_increment'])
@@ -137,12 +140,12 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
                 f'{path}: ends early, {name} has {part.read_length} of {part.expected_length} '
                 'samples in its last segment; copy or record it again'
             )
-    return _table(arrays, arrays, path, options, periods)
+    return _table(arrays, arrays, path, _renamed(options, paths, arrays), periods)
 
 
 def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
     """Read a file of Apache Parquet."""
-    parquet = _library('pyarrow.parquet', path, 'pyarrow')
+    parquet = library('pyarrow.parquet', path, 'pyarrow')
     with _damage(path, 'Parquet file', 'write it again'), parquet.ParquetFile(path) as file:
         _check_size(8 * file.metadata.num_rows * file.metadata.num_columns)
         table = file.read()
@@ -156,7 +159,23 @@ def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
 # --- what they share ------------------------------------------------------------------------
 
 
-def _library(module: str, path: Path, package: str = '') -> Any:
+def _renamed(
+    options: ReadOptions, paths: Iterable[tuple[str, str]], names: Container[str]
+) -> ReadOptions:
+    """Return options that call columns by their names, where they call them by their paths."""
+    known: dict[tuple[str, ...], set[str]] = {}
+    for place, name in paths:
+        known.setdefault(words_of(place), set()).add(name)
+    columns = {}
+    for role, wanted in options.named.items():
+        # two paths may have the same words
+        fitting = [] if wanted in names else [*known.get(words_of(wanted), ())]
+        columns[role] = fitting[0] if len(fitting) == 1 else wanted
+    return replace(options, columns=columns)
+
+
+def library(module: str, path: Path, package: str = '') -> Any:
+    """Import what reads a kind of file; DataError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -29,15 +29,18 @@ WIDTH = 32
 
 #: what dSPACE's ControlDesk and Simulink call the samples of a signal, whose name stands beside
 _TITLED = ('Data', 'values')
-#: name of the list of all variables in what the child writes; MATLAB allows no such name
-_ALL = '*'
+#: names of lists in what the child writes: all variables, columns that a title names, and what
+#: MATLAB calls these; MATLAB allows no such names
+_ALL, _TITLES, _PATHS = '*', '*titles', '*paths'
 
 
 def read_variables(
     path: Path, wanted: str, needed: Iterable[str] | None
-) -> tuple[tuple[str, ...], dict[str, NDArray[Any]]]:
+) -> tuple[tuple[str, ...], dict[str, NDArray[Any]], dict[str, str]]:
     """
     Return the names of all variables of a MATLAB file of version 4 to 7, and the wanted ones.
+
+    The last mapping gives the name of a column by the path to it, where a title names the column.
 
     `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
     arrays of str.  Where the file lacks one of those `needed`, or they are None, all numbers in it
@@ -62,12 +65,15 @@ def read_variables(
             raise ValueError(lines[-1] if lines else f'SciPy ended with {done.returncode}')
         with np.load(target, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    return tuple(arrays.pop(_ALL).tolist()), arrays
+    names, titles, paths = (arrays.pop(key).tolist() for key in (_ALL, _TITLES, _PATHS))
+    return tuple(names), arrays, dict(zip(paths, titles, strict=True))
 
 
-def flat(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+def flat(name: str, value: Any, *, titled: bool = True) -> Iterator[tuple[str, NDArray[Any]]]:
     """
     Yield the columns of numbers in a variable: fields of structs, columns of narrow matrices.
+
+    With `titled`, a name that stands beside the samples of a signal takes the place of their path.
 
     >>> import numpy as np
     >>> [(name, x.size) for name, x in flat('m', np.zeros((100, 2)))]
@@ -79,14 +85,15 @@ def flat(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     for key in x.dtype.names or ():
         part = x[key]
         if part.dtype != object:
-            yield from flat(f'{name}.{key}', part)
+            yield from flat(f'{name}.{key}', part, titled=titled)
         elif part.size <= WIDTH:
-            titles = [_title(struct) if key in _TITLED else '' for struct in x.ravel()]
+            is_titled = titled and key in _TITLED
+            titles = [_title(struct) if is_titled else '' for struct in x.ravel()]
             for i, (title, cell) in enumerate(zip(titles, part.ravel(), strict=True), 1):
                 plain = key if part.size == 1 else f'{i}.{key}'
                 # two may be called alike
                 title = title if titles.count(title) == 1 else ''
-                yield from flat(f'{name}.{title or plain}', cell)
+                yield from flat(f'{name}.{title or plain}', cell, titled=titled)
     if x.dtype.kind in 'biufM':
         if sum(size != 1 for size in x.shape) <= 1:
             yield name, x.ravel()
@@ -123,12 +130,18 @@ def _main(path: str, wanted: str, asked: str, target: str) -> None:
     # without names it would read all of them
     read = scipy.io.loadmat(path, variable_names=used) if used else {}
     arrays: dict[str, Any] = {}
+    paths: dict[str, str] = {}
     for name in used:
         if whole or name == 'segment_name':
             arrays[name] = _plain(name, read[name])
         else:
-            arrays |= flat(name, read[name])
+            columns = [*flat(name, read[name])]
+            plain = flat(name, read[name], titled=False)
+            paths |= {path: key for (path, _), (key, _) in zip(plain, columns, strict=True)}
+            arrays |= columns
     arrays[_ALL] = np.array(names if whole else [*arrays], dtype=str)
+    titled = [(path, name) for path, name in paths.items() if path != name]
+    arrays[_PATHS], arrays[_TITLES] = np.array(titled, dtype=str).reshape(-1, 2).T
     np.savez(target, **arrays)
 
 

@@ -635,6 +635,72 @@ def test_a_stroke_that_is_none_brings_a_unit_that_is_taken(tmp_path, capsys):
         pi.read(path)
 
 
+# --- names as other programs print them -----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'columns',
+    [
+        {'v': 'run1/ao0', 'y': 'run1/ai0'},
+        {'v': '/run1/ao0', 'y': 'run1.ai0'},
+        {'v': 'RUN1/AO0', 'y': 'run1/both(:,2)'},
+        {'v': 'run 2/ao0', 'y': 'run1/ai0'},
+    ],
+)
+def test_columns_by_the_path_in_an_hdf5_file(tmp_path, columns):
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(tmp_path / 'r.h5', 'w') as file:
+        file['run1/ao0'], file['run1/ai0'], file['run 2/ao0'] = V, UM, V + 1
+        file['run1/both'] = np.column_stack([V, UM])
+        file['run1/both'].attrs['unit'] = 'um'
+        file['run1/ai0'].attrs['unit'] = 'um'
+    (piece,) = pi.read(tmp_path / 'r.h5', columns=columns, rate=RATE).pieces
+    np.testing.assert_array_equal(piece.v, V + ('2' in columns['v']))
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    'columns',
+    [
+        {'v': 'Log/out', 'y': 'Log/Strain gauge'},
+        {'v': "/'Log'/'out'", 'y': "/'Log'/'Strain gauge'"},
+        {'v': 'Log.out', 'y': 'Strain gauge'},
+        {'v': 'Log/out', 'y': 'Log Strain/gauge'},
+    ],
+)
+def test_columns_by_group_and_channel_of_a_tdms_file(tmp_path, columns):
+    tdms = pytest.importorskip('nptdms')
+    channels = [('Log', 'out', V, 'V'), ('Log', 'Strain gauge', UM, 'um'), ('B', 'out', -V, 'V')]
+    # its words are those of another path
+    channels += [('Log Strain', 'gauge', UM, 'um')] * (columns['y'] == 'Log Strain/gauge')
+    with tdms.TdmsWriter(tmp_path / 'r.tdms') as writer:
+        for group, name, x, unit in channels:
+            wave = {'wf_increment': 1 / RATE, 'unit_string': unit}
+            writer.write_segment([tdms.ChannelObject(group, name, x, wave)])
+    if len(channels) > 3:
+        with pytest.raises(DataError, match=r'no column .Log Strain/gauge'):
+            pi.read(tmp_path / 'r.tdms', columns=columns)
+        return
+    (piece,) = pi.read(tmp_path / 'r.tdms', columns=columns).pieces
+    np.testing.assert_array_equal(piece.v, V)
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
+def test_columns_by_the_fields_of_matlab_structs(tmp_path):
+    signals = np.empty((1, 2), dtype=[('values', object), ('label', object)])
+    signals[0] = [(UM[:, None], 'pos_um'), (V[:, None], 'u')]
+    out = {'time': K / RATE, 'signals': signals}
+    run = {'ao0': V, 'ai0_um': UM, 'm': np.column_stack([UM, V])}
+    scipy.io.savemat(tmp_path / 's.mat', {'out': out, 'run': run})
+    for columns in (
+        {'v': 'out.signals(2).values', 'y': 'out.signals(1).values'},
+        {'v': 'run.m(:,2)', 'y': 'run/ai0_um'},
+    ):
+        (piece,) = pi.read(tmp_path / 's.mat', columns=columns, rate=RATE).pieces
+        np.testing.assert_array_equal(piece.v, V)
+        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
 # --- the sampling rate in a header ----------------------------------------------------------
 
 
