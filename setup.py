@@ -75,6 +75,8 @@ setup(
         'rosbags>=0.11,<0.12',
         'scipy>=1.11,<2',
         'tqdm>=4.60,<5',
+        # for compressed files of bags; comes with mcap, and need not be there either
+        'zstandard>=0.15,<1',
     ],
     extras_require={
         # Real ROS 2 Jazzy for a machine without ROS.  Never on top of a ROS installation.

@@ -10,7 +10,7 @@ import numpy as np
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.bags.write import BagWriter
 from piezo_ident.record.blocks import encode, Samples
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 import yaml
 
 
@@ -26,18 +26,29 @@ def blocks(n: int = 1000, size: int = 100, seed: int = 0) -> list[tuple[Samples,
     ]
 
 
-def write(path: Path, messages: Iterable[tuple[str, Samples]], edit=None) -> Path:
+def write(
+    path: Path,
+    messages: Iterable[tuple[str, Samples]],
+    edit=None,
+    *,
+    stamp=lambda i: 10**9 + i * 10**6,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode | None = None,
+) -> Path:
     """Write messages in the order given, one a millisecond, as a recorder would."""
     store = typestore()
     connections = {}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    writer = Writer(path, version=9, storage_plugin=storage)
+    if compression is not None:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         for i, (topic, samples) in enumerate(messages):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, MESSAGE_TYPE, typestore=store)
             data, dims = encode(samples)
             if edit is not None:
                 data, dims = edit(i, data, dims)
-            writer.write(connections[topic], 10**9 + i * 10**6, serialized(data, dims))
+            writer.write(connections[topic], stamp(i), serialized(data, dims))
     return path
 
 

@@ -58,8 +58,8 @@ ROSDEP_KEYS = {
     'yaml': 'python3-yaml',
 }
 
-# Has no rosdep key: imported only to read an unfinished mcap file, and need not be there.
-PIP_ONLY = {'mcap'}
+# Have no rosdep key: imported only to read unfinished or compressed bags, and need not be there.
+PIP_ONLY = {'mcap', 'zstandard'}
 
 # Of the extras: imported only where somebody asks for what they do.
 OPTIONAL = {'distributed'}

@@ -64,8 +64,9 @@ An output is written under the name `.NAME.RANDOM.tmp` in the same folder (`.new
 report folder) and renamed when it is whole; a bag that replaces another changes places with it in
 one step. A process that is killed leaves such a name, which can be deleted, and what stood there
 before. A report is several files: they are put in place one by one, the page last, so that a kill
-in between leaves some of the old and some of the new, each whole. Recovering an unfinished sqlite3
-bag works on a copy in the folder for temporary files, `piezo_ident_bag_RANDOM`.
+in between leaves some of the old and some of the new, each whole. An unfinished sqlite3 bag, and a
+compressed file of a bag, are read from a copy in the folder for temporary files,
+`piezo_ident_bag_RANDOM`.
 
 ## The safety property
 

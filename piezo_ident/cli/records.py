@@ -17,6 +17,7 @@ from typing import Any
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.record import io as record_io
+from piezo_ident.record.bags.recover import storage_of
 from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Fault, Record
@@ -50,7 +51,7 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
             elif place.is_dir():
                 below = sorted(filter(_is_record, place.glob('[!.]*')))
                 # of a bag that was not finished
-                parts = [p for p in below if p.suffix.lower() in BAG_FILES]
+                parts = [*filter(storage_of, below)]
                 inside += parts
                 # the results of many records are none
                 if len(below) > len(parts) and not (place / MARK).is_file():
@@ -75,9 +76,11 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
 
 
 def _is_record(path: Path) -> bool:
-    return (path / 'metadata.yaml').is_file() or (
-        path.is_file() and path.suffix.lower() in RECORD_FILES
-    )
+    return (path / 'metadata.yaml').is_file() or (path.is_file() and _is_named_as_record(path))
+
+
+def _is_named_as_record(path: Path) -> bool:
+    return path.suffix.lower() in RECORD_FILES or bool(storage_of(path))
 
 
 def expand_apart(
@@ -96,7 +99,7 @@ def expand_apart(
 def check_order(model: Path, record: Path, verb: str) -> None:
     """Refuse a model and a record in the wrong order."""
     order = f'MODEL comes first: piezo_ident {verb} model.yaml record.csv'
-    if model.suffix.lower() in RECORD_FILES or model.is_dir():
+    if _is_named_as_record(model) or model.is_dir():
         raise ConfigError(f'{model}: is a record, no model file; {order}')
     if record.suffix.lower() in MODEL_FILES:
         raise ConfigError(f'{record}: is no record; {order}')
@@ -104,13 +107,13 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
     """Refuse options that choose topics where no record is a bag, or columns where all are."""
-    tables = all(p.is_file() and p.suffix.lower() not in BAG_FILES for p in paths)
+    tables = all(p.is_file() and not storage_of(p) for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
         if tables and getattr(args, option, None) is not None:
             raise ConfigError(
                 f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
             )
-    bags = all(p.is_dir() or p.suffix.lower() in BAG_FILES for p in paths)
+    bags = all(p.is_dir() or storage_of(p) for p in paths)
     for option in ('columns', 'rate', 'time_unit', 'voltage_unit'):
         if bags and getattr(args, option, None) is not None:
             raise ConfigError(

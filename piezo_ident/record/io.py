@@ -18,6 +18,7 @@ from piezo_ident.common.files import broken_link, check_regular, temporary_outpu
 from piezo_ident.record.arrays import read_hdf5, read_mat, read_npz, read_parquet, read_tdms
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
+from piezo_ident.record.bags.recover import storage_of
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.channels import channel_of_column, column_of, role_of
 from piezo_ident.record.columns import RecordTable
@@ -97,7 +98,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     broken = broken_link(path)
     if broken:
         raise DataError(f'{path}: {broken}')
-    if path.is_dir() or suffix in ('.mcap', '.db3'):
+    if path.is_dir() or storage_of(path):
         return read_bag(path, options)
     if not path.exists():
         raise DataError(f'{path}: does not exist; check the name')

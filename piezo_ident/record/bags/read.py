@@ -13,9 +13,11 @@ far as it goes when that is asked for.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import replace
 import functools
+import itertools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +27,16 @@ from piezo_ident.record.bags.recover import (
     damage_as_data_error,
     is_unfinished,
     metadata,
-    recovered_bag,
+    scanned_bag,
+    storage_of,
     Stored,
+    unpacked,
 )
 from piezo_ident.record.blocks import decode, quantity_of, Samples
 from piezo_ident.record.channels import applied_key, channel_of_quantity
 from piezo_ident.record.join import APPLIED, record_of_streams
 from piezo_ident.record.options import ReadOptions
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
@@ -49,12 +53,14 @@ def typestore() -> Typestore:
 
 
 @contextmanager
-def opened_bag(path: str | Path) -> Iterator[Bag]:
+def opened_bag(path: str | Path, *, in_file_order: bool = False) -> Iterator[Bag]:
     """
     Open a rosbag2 folder, or a single .mcap or .db3 file, as far as it was finished.
 
-    DataError when it is no bag, or damaged beyond what a killed recorder leaves; its messages
-    raise it too, for damage that shows itself later.
+    The file may be compressed as a whole, or message by message.  With `in_file_order` the
+    messages come as they were written, also where their log times are indexed.  DataError when
+    it is no bag, or damaged beyond what a killed recorder leaves; its messages raise it too, for
+    damage that shows itself later.
     """
     path = Path(path)
     try:
@@ -63,14 +69,15 @@ def opened_bag(path: str | Path) -> Iterator[Bag]:
         raise DataError(f'{path}: cannot be read ({error.strerror or error})') from None
     if not is_there:
         raise DataError(f'{path}: does not exist; check the name')
-    if path.is_file() and path.suffix != path.suffix.lower():
+    if path.is_file() and not path.name.endswith((storage_of(path), '.zstd', '.zst')):
         raise DataError(f'{path}: a bag is known by .mcap or .db3 in small letters; rename it')
-    if path.suffix == '.db3' and any(c in str(path) for c in '?#%'):
+    if storage_of(path) == '.db3' and any(c in str(path) for c in '?#%'):
         raise DataError(f'{path}: rosbags cannot open names with ?, # or %; rename it')
     with ExitStack() as stack:
         with damage_as_data_error(path):
-            unfinished = is_unfinished(path)
-            bag = recovered_bag(path, stack) if unfinished else _finished(path, stack)
+            is_packed = path.is_file() and path.suffix != storage_of(path)
+            scan = is_unfinished(path) or is_packed or in_file_order
+            bag = scanned_bag(path, stack) if scan else _finished(path, stack)
         yield bag
 
 
@@ -78,6 +85,8 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
     if path.is_dir():
         metadata(path)
     reader = stack.enter_context(Reader(path))
+    if not _has_index(reader):
+        return scanned_bag(path, stack)
     empty = reader.message_count == 0
     start = 0 if empty else reader.start_time
     end = 0 if empty else reader.end_time - 1
@@ -90,15 +99,30 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
         if connections:  # rosbags takes none for all
             with damage_as_data_error(path):
-                for connection, stamp, raw in reader.messages(list(connections)):
-                    yield Stored(connection, stamp, raw)
+                stored = itertools.starmap(Stored, reader.messages([*connections]))
+                yield from unpacked(stored, path)
 
     return Bag(path, reader.connections, messages, start, end)
+
+
+def _has_index(reader: Reader) -> bool:
+    """Return whether every message of an mcap file is indexed: rosbags passes over the others."""
+    storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
+    for storage in storages:
+        chunks = getattr(storage, 'chunks', None)
+        indexed = sum(sum(chunk.channel_count.values()) for chunk in chunks or ())
+        # without statistics rosbags counts by the index too
+        if chunks is not None and indexed < max(storage.metadata.message_count, len(chunks[:1])):
+            return False
+    return True
 
 
 def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: Any) -> Record:
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file; `choices` replace fields of the options.
+
+    The order of the blocks is that of their log times.  Where the clock of these was set back,
+    the order of the file is taken.
 
     Where the bag holds ``applied_voltage`` beside the voltage, samples that the amplifier's guard
     altered are cut out, as in a live capture.  DataError for a damaged bag, for blocks whose
@@ -115,12 +139,54 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
             )
         asked = {'voltage': options.voltage_topic, 'displacement': options.displacement_topic}
         topics = _choose(carried_quantities(bag), asked, options.namespace, path)
-        streams = {quantity: BlockStream(spooled=True) for quantity in topics}
-        for quantity, samples, stamp in _blocks(bag, topics):
-            streams[quantity].append(samples, stamp)
+        blocks = _Blocks(bag, topics)
+    # in the file of a clock that was set back, the samples go on
+    if blocks.back:
+        with suppress(DataError), opened_bag(path, in_file_order=True) as other:
+            recorded = _Blocks(other, topics)
+            if recorded.back < blocks.back and not other.faults:
+                blocks = recorded
     return record_of_streams(
-        streams, name=str(path), options=options, sample_rate=_sample_rate(path), faults=bag.faults
+        blocks.streams,
+        name=str(path),
+        options=options,
+        sample_rate=_sample_rate(path),
+        faults=(*bag.faults, *blocks.faults),
     ).renamed(path.name)
+
+
+class _Blocks:
+    """
+    The blocks of some topics of a bag, by quantity.
+
+    Attributes
+    ----------
+    streams : dict of str to BlockStream
+    back : int
+        How many blocks begin before the end of the one before.
+    faults : tuple of Fault
+        Whether the clock of the log times was set back.
+    """
+
+    def __init__(self, bag: Bag, topics: Mapping[str, str]) -> None:
+        self.streams = {quantity: BlockStream(spooled=True) for quantity in topics}
+        self.back = 0
+        ends = dict.fromkeys(topics, -math.inf)
+        # later by what the clock was set back, so that they rise on every topic
+        stamps, shift = dict.fromkeys(topics, -(2**63)), 0
+        steps: list[int] = []
+        for quantity, samples, stamp in _blocks(bag, topics):
+            if stamp + shift < stamps[quantity]:
+                steps.append(stamps[quantity] - shift - stamp)
+                shift = max(stamps.values()) - stamp
+            stamps[quantity] = stamp + shift
+            self.streams[quantity].append(samples, stamp + shift)
+            if samples.t.size:
+                self.back += bool(samples.t[0] <= ends[quantity])
+                ends[quantity] = float(samples.t[-1])
+        where = f'by {max(steps, default=0) / 1e9:.3g} s from one block to the next'
+        fault = Fault('log_time_step', where, len(steps), 'blocks taken in the order of the file')
+        self.faults = (fault,) if steps else ()
 
 
 def _sample_rate(path: Path) -> float | None:

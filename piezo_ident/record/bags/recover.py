@@ -2,18 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags whose recorder was killed, read as far as they go.
+Bags read from the beginning of their files, message by message: those that an index cannot open.
 
 An unfinished bag has no metadata.yaml, an mcap file without its end, or an sqlite3 file with the
 journal of a transaction beside it.  Of an mcap file every whole chunk is read; of a database all
-that was committed.  The bag itself is not changed: a journal is applied to a copy.
+that was committed.  The bag itself is not changed: a journal is applied to a copy, and a file
+that is compressed as a whole is unpacked to one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
+import heapq
 import itertools
 from pathlib import Path
 import re
@@ -24,6 +26,7 @@ from typing import Any, NamedTuple
 
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import check_regular, load_yaml
+from piezo_ident.record.arrays import library
 from piezo_ident.record.record import Fault
 from rosbags.interfaces import (
     Connection,
@@ -37,6 +40,13 @@ from rosbags.rosbag2.metadata import parse_qos
 #: first and last bytes of an mcap file
 _MAGIC = b'\x89MCAP0\r\n'
 _SIDECARS = ('-journal', '-wal')
+_BAG_FILE = re.compile(r'(?P<name>.+(?P<storage>\.mcap|\.db3))(\.zstd?)?', re.IGNORECASE)
+#: first bytes of what zstd compressed; a message itself begins with a zero
+_ZSTD = b'\x28\xb5\x2f\xfd'
+#: bytes that are unpacked together
+_UNPACKED = 1 << 22
+#: a recorder compresses so many messages at once, at most, and writes each when it is done
+_AT_ONCE = 64
 _FORMATS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
 
 
@@ -63,7 +73,8 @@ class Bag:
     connections : list of Connection
         The topics, with types, QoS profiles and numbers of messages.
     messages : callable
-        Yields the messages of some connections in the order of their log times.
+        Yields the messages of some connections, in the order of their log times where the bag has
+        an index of these, else in that of the files.
     start, end : int
         Log times of the first and the last message [ns]; equal for an empty bag.
     faults : tuple of Fault
@@ -76,6 +87,17 @@ class Bag:
     start: int
     end: int
     faults: tuple[Fault, ...] = ()
+
+
+def storage_of(path: Path) -> str:
+    """
+    Return which storage a file of a bag has by its name, compressed or not; empty for no bag.
+
+    >>> [storage_of(Path(x)) for x in ('a.mcap', 'a_0.db3.zstd', 'a.csv')]
+    ['.mcap', '.db3', '']
+    """
+    found = _BAG_FILE.fullmatch(path.name)
+    return found['storage'].lower() if found else ''
 
 
 @contextmanager
@@ -119,19 +141,20 @@ def _storage_files(path: Path) -> list[Path]:
         except (ConfigError, TypeError, KeyError):
             return []  # opening it meets the same
         return [file for file in listed if file.exists()]
-    files = [f for f in sorted(path.iterdir()) if f.suffix in ('.mcap', '.db3')]
+    files = [f for f in sorted(path.iterdir()) if storage_of(f)]
     if not files:
         raise DataError(
             f'{path}: no bag, metadata.yaml is missing; name a bag folder, or restore it with '
             "'ros2 bag reindex'"
         )
     # a split recording numbers its files; other files side by side are recordings of their own
-    if len({(re.sub(r'_\d+$', '', f.stem), f.suffix) for f in files}) > 1:
+    names = {f: f.name[: f.name.lower().index(storage_of(f))] for f in files}
+    if len({(re.sub(r'_\d+$', '', name), storage_of(f)) for f, name in names.items()}) > 1:
         raise DataError(
             f'{path}: no bag, metadata.yaml is missing; name one of its files: '
             + ', '.join(f.name for f in files)
         )
-    return sorted(files, key=lambda f: int((re.findall(r'\d+$', f.stem) or ['0'])[0]))
+    return sorted(files, key=lambda f: int((re.findall(r'\d+$', names[f]) or ['0'])[0]))
 
 
 def _is_cut_off(file: Path) -> bool:
@@ -169,11 +192,17 @@ class _Part(NamedTuple):
     lacking: str
 
 
-def recovered_bag(path: Path, stack: ExitStack) -> Bag:
-    """Open an unfinished bag, which `stack` closes; DataError when no whole message is in it."""
+def scanned_bag(path: Path, stack: ExitStack) -> Bag:
+    """
+    Open a bag whose messages come in the order of its files; `stack` closes it.
+
+    Its faults say what is missing.  DataError when no whole message is in it.
+    """
     parts = []
-    for file in _storage_files(path):
-        part = _mcap_part(file) if file.suffix == '.mcap' else _sqlite_part(file, stack)
+    for packed in _storage_files(path):
+        file = _unpacked_file(packed, stack)
+        is_mcap = storage_of(packed) == '.mcap'
+        part = _mcap_part(file) if is_mcap else _sqlite_part(file, stack)
         parts += [part] if part.connections else []
     if not parts:
         raise DataError(
@@ -188,12 +217,11 @@ def recovered_bag(path: Path, stack: ExitStack) -> Bag:
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
         wanted = {(c.topic, c.msgtype) for c in connections}
         with damage_as_data_error(path):
-            for connection, stamp, raw in itertools.chain.from_iterable(
-                part.messages() for part in parts
-            ):
-                key = (connection.topic, connection.msgtype)
-                if key in wanted:
-                    yield Stored(known[key], stamp, raw)
+            every = itertools.chain.from_iterable(part.messages() for part in parts)
+            keys = ((m, (m.connection.topic, m.connection.msgtype)) for m in every)
+            yield from unpacked(
+                (m._replace(connection=known[key]) for m, key in keys if key in wanted), path
+            )
 
     connections = list(known.values())
     start, end = min(part.start for part in parts), max(part.end for part in parts)
@@ -203,12 +231,52 @@ def recovered_bag(path: Path, stack: ExitStack) -> Bag:
     fault = Fault(
         'truncated_bag',
         f'in {path.name}, {(end - start) / 1e9:.3f} s after its first message',
-        len(lacking) or 1,
+        len(lacking),
         f'recovered the {sum(c.msgcount for c in connections)} messages before that; the recorder '
-        f'did not close the bag ({"; ".join(lacking) or "its end is missing"}), so what came '
-        'later is lost and how much it was is unknown',
+        f'did not close the bag ({"; ".join(lacking)}), so what came later is lost and how much '
+        'it was is unknown',
     )
-    return Bag(path, connections, messages, start, end, (fault,))
+    return Bag(path, connections, messages, start, end, (fault,) if lacking else ())
+
+
+def unpacked(messages: Iterable[Stored], path: Path) -> Iterator[Stored]:
+    """Yield messages, those that were compressed one by one unpacked and in order again."""
+    held: list[tuple[int, int, Stored]] = []
+    for i, message in enumerate(messages):
+        if message.raw[:4] != _ZSTD:
+            yield message
+            continue
+        zstd = library('zstandard', path).ZstdDecompressor().decompressobj()
+        raw = zstd.decompress(message.raw)
+        heapq.heappush(held, (message.stamp, i, message._replace(raw=raw)))
+        if len(held) > _AT_ONCE:
+            yield heapq.heappop(held)[2]
+    while held:
+        yield heapq.heappop(held)[2]
+
+
+def _unpacked_file(file: Path, stack: ExitStack) -> Path:
+    """Return a file itself, or a copy that is unpacked."""
+    found = _BAG_FILE.fullmatch(file.name)
+    if found is None or found['name'] == file.name:
+        return file
+    copy = _work_folder(stack) / found['name']
+    try:
+        with file.open('rb') as source, copy.open('wb') as target:
+            zstd = library('zstandard', file).ZstdDecompressor()
+            reader = zstd.stream_reader(source, read_across_frames=True)
+            while part := reader.read(_UNPACKED):
+                target.write(part)
+    except OSError as error:
+        raise DataError(
+            f'{file}: cannot be unpacked in {copy.parent.parent} ({error.strerror}); make room, '
+            'or set TMPDIR to a place with room'
+        ) from None
+    return copy
+
+
+def _work_folder(stack: ExitStack) -> Path:
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='piezo_ident_bag_')))
 
 
 def _mcap_part(file: Path) -> _Part:
@@ -220,7 +288,8 @@ def _mcap_part(file: Path) -> _Part:
         old = counted.get(key, connection)
         counted[key] = old._replace(msgcount=old.msgcount + 1)
         start, end = min(start, stamp), max(end, stamp)
-    lacking = '' if scan.is_whole else f'the end of {file.name} is missing'
+    is_whole = scan.is_whole and not _is_cut_off(file)
+    lacking = '' if is_whole else f'the end of {file.name} is missing'
     return _Part(list(counted.values()), scan.messages, start, end, lacking)
 
 
@@ -234,33 +303,27 @@ class _McapScan:
     def messages(self) -> Iterator[Stored]:
         """Yield the messages of every whole chunk."""
         # no ROS distribution packages it, so it may not be there
-        try:
-            from mcap.records import Channel, DataEnd, Message, Schema
-            from mcap.stream_reader import StreamReader
-        except ImportError:
-            raise DataError(
-                f'{self._file}: an unfinished .mcap file is read by the Python package mcap; '
-                "install it with 'pip install mcap'"
-            ) from None
-        schemas: dict[int, Schema] = {}
+        kinds = library('mcap.records', self._file, 'mcap')
+        stream_reader = library('mcap.stream_reader', self._file, 'mcap')
+        schemas: dict[int, Any] = {}
         connections: dict[int, Connection] = {}
         size = self._file.stat().st_size
         with self._file.open('rb') as stream:
-            reader = StreamReader(stream, validate_crcs=True, record_size_limit=size)
+            reader = stream_reader.StreamReader(stream, validate_crcs=True, record_size_limit=size)
             try:
                 for record in reader.records:
-                    if isinstance(record, Schema):
+                    if isinstance(record, kinds.Schema):
                         schemas[record.id] = record
-                    elif isinstance(record, Channel):
+                    elif isinstance(record, kinds.Channel):
                         if record.message_encoding == 'cdr':
                             schema = schemas[record.schema_id]
                             connections[record.id] = _connection(record, schema)
-                    elif isinstance(record, Message):
+                    elif isinstance(record, kinds.Message):
                         if record.channel_id in connections:
                             yield Stored(
                                 connections[record.channel_id], record.log_time, record.data
                             )
-                    elif isinstance(record, DataEnd):
+                    elif isinstance(record, kinds.DataEnd):
                         self.is_whole = True
                         return
             # struct, zstd, lz4 and mcap have errors of their own for a file that ends too early
@@ -288,14 +351,26 @@ def _connection(channel: Any, schema: Any) -> Connection:
 
 
 def _sqlite_part(file: Path, stack: ExitStack) -> _Part:
-    reader = stack.enter_context(Reader(_applied(file, stack)))
+    database = _applied(file, stack)
+    reader = stack.enter_context(Reader(database))
+    connections = {c.id: c for c in reader.connections if c.msgcount}
 
     def messages() -> Iterator[Stored]:
-        return itertools.starmap(Stored, reader.messages())
+        # rosbags has them by their log times alone
+        place = f'{database.resolve().as_uri()}?mode=ro&immutable=1'
+        with closing(sqlite3.connect(place, uri=True)) as opened:
+            for topic, *stored in opened.execute(
+                'SELECT topic_id, timestamp, data FROM messages ORDER BY id'
+            ):
+                if topic in connections:
+                    yield Stored(connections[topic], *stored)
 
     lacking = f'{file.name} has a transaction that was never finished' if _sidecars(file) else ''
-    connections = [c for c in reader.connections if c.msgcount]
-    return _Part(connections, messages, reader.start_time, reader.end_time - 1, lacking)
+    if not lacking and _is_cut_off(file):
+        lacking = f'the end of {file.name} is missing'
+    return _Part(
+        [*connections.values()], messages, reader.start_time, reader.end_time - 1, lacking
+    )
 
 
 def _applied(file: Path, stack: ExitStack) -> Path:
@@ -303,7 +378,7 @@ def _applied(file: Path, stack: ExitStack) -> Path:
     parts = [file, *_sidecars(file)]
     if len(parts) == 1:
         return file
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix='piezo_ident_bag_')))
+    folder = _work_folder(stack)
     need = sum(p.stat().st_size for p in parts)
     if shutil.disk_usage(folder).free < 2 * need:
         raise DataError(

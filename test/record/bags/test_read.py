@@ -4,10 +4,14 @@
 """Bags as other tools read them, and bags as live recordings leave them."""
 
 from collections.abc import Iterable
+import re
+import shlex
+import sys
 
 from bag_data import blocks, metadata, write
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.cli import main
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.capture import Capture
 from piezo_ident.record.bags.read import MESSAGE_TYPE, read_bag
@@ -16,11 +20,14 @@ from piezo_ident.record.blocks import Dimension, Samples
 from piezo_ident.record.join import APPLIED
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
-from rosbags.rosbag2 import storage_mcap
+from rosbags.rosbag2 import CompressionMode, storage_mcap, StoragePlugin
+from zstandard import ZstdCompressor
 
 pytest.importorskip('mcap_ros2', reason="mcap is not installed: see the extra 'test'")
 
 from mcap.reader import make_reader
+from mcap.writer import IndexType
+from mcap.writer import Writer as McapWriter
 from mcap_ros2.decoder import DecoderFactory
 
 RATE = 1000.0
@@ -138,6 +145,134 @@ def test_streams_that_never_meet_are_refused(tmp_path):
     pairs = [(v, Samples(y.t + 1e-4, y.values, '', y.quantity)) for v, y in blocks()]
     with pytest.raises(DataError, match='share no time stamp'):
         read_bag(write(tmp_path / 'bag', interleave(pairs)))
+
+
+@pytest.mark.parametrize('storage', StoragePlugin)
+@pytest.mark.parametrize('step', [0.3, 1.0, 3.0])
+def test_a_log_clock_that_is_set_back(tmp_path, storage, step):
+    # as by NTP; two blocks come every 10 ms
+    def stamp(i):
+        return 10**10 + i * 5_000_000 - (round(step * 1e9) if i >= 200 else 0)
+
+    pairs = blocks(20_000)
+    (piece,) = (
+        got := read_bag(write(tmp_path / 'bag', interleave(pairs), stamp=stamp, storage=storage))
+    ).pieces
+    assert piece.n == 20_000
+    for x, i in ((piece.v, 0), (piece.y, 1)):
+        np.testing.assert_array_equal(x, np.concatenate([pair[i].values for pair in pairs]))
+    assert faults(got) == {'log_time_step': 1}
+
+
+def test_a_log_clock_that_is_set_back_and_a_restart(tmp_path):
+    # the stage starts over, and later the clock of the log does
+    def stamp(i):
+        return 10**10 + i * 50_000_000 - (10**9 if i >= 60 else 0)
+
+    messages = interleave([*blocks(2000, seed=1), *blocks(2000, seed=2)])
+    got = read_bag(write(tmp_path / 'bag', messages, stamp=stamp))
+    assert [(p.n, p.start_time) for p in got] == [(2000, 0.0), (2000, 0.0)]
+    np.testing.assert_array_equal(got.pieces[1].y[1900:], messages[-1][1].values)
+    assert faults(got) == {'log_time_step': 1, 'restart': 1}
+
+
+def test_messages_that_were_written_out_of_turn_are_in_the_order_of_their_log_times(tmp_path):
+    messages, order = interleave(blocks()), [*range(20)]
+    order[6:10] = [8, 9, 6, 7]
+
+    def stamp(i):
+        return 10**9 + order[i] * 10**6
+
+    got = read_bag(write(tmp_path / 'bag', [messages[k] for k in order], stamp=stamp))
+    assert [p.n for p in got] == [1000] and not got.faults
+
+
+@pytest.mark.parametrize('statistics', [True, False])
+@pytest.mark.parametrize('folder', [True, False])
+def test_chunks_without_an_index_of_their_messages(tmp_path, statistics, folder):
+    want = record()
+    write_bag(want, tmp_path / 'bag')
+    file = tmp_path / 'bag' / 'bag.mcap'
+    with file.open('rb') as source, (tmp_path / 'bare.mcap').open('wb') as target:
+        writer = McapWriter(target, index_types=IndexType.CHUNK, use_statistics=statistics)
+        writer.start('ros2', 'test')
+        ids = {}
+        for schema, channel, m in make_reader(source).iter_messages():
+            if channel.topic not in ids:
+                about = writer.register_schema(schema.name, schema.encoding, schema.data)
+                ids[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, about, dict(channel.metadata)
+                )
+            writer.add_message(ids[channel.topic], m.log_time, m.data, m.publish_time)
+        writer.finish()
+    path = tmp_path / 'bare.mcap'
+    if folder:
+        path = path.rename(file).parent
+    got = read_bag(path)
+    (piece,) = got
+    assert not got.faults and piece.segments == want.pieces[0].segments
+    np.testing.assert_array_equal(piece.y, want.pieces[0].y)
+
+
+@pytest.mark.parametrize('storage', StoragePlugin)
+@pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_bags_and_what_is_left_of_them(tmp_path, storage, mode, capsys):
+    path = write(tmp_path / 'bag', interleave(blocks()), storage=storage, compression=mode)
+    (file,) = (f for f in path.iterdir() if f.name != 'metadata.yaml')
+    assert file.suffix == '.zstd' or mode is CompressionMode.MESSAGE
+    want = np.concatenate([y.values for _, y in blocks()])
+    for whole in (path, file):
+        got = read_bag(whole)
+        np.testing.assert_array_equal(got.pieces[0].y, want)
+        assert not got.faults
+    # by a verb, which knows it for a bag
+    assert main(['convert', str(file), str(tmp_path / 'a.npz'), '--namespace', '/']) == 0
+    (path / 'metadata.yaml').unlink()
+    with pytest.raises(DataError) as caught:
+        read_bag(path)
+    # the command that is named is typed
+    shown = re.search(r"'piezo_ident (.*) OUT'", str(caught.value))[1]
+    assert main([*shlex.split(shown), str(tmp_path / 'b.npz')]) == 0
+    np.testing.assert_array_equal(pi.read(tmp_path / 'b.npz').pieces[0].y, want)
+    assert 'metadata.yaml is missing' in capsys.readouterr().out
+
+
+def test_compressed_messages_that_threads_wrote_out_of_turn(tmp_path):
+    # each thread writes the message that it has compressed
+    messages, order = interleave(blocks()), [*range(20)]
+    order[6:10] = [8, 9, 6, 7]
+    path = write(
+        tmp_path / 'bag',
+        [messages[k] for k in order],
+        stamp=lambda i: 10**9 + order[i] * 10**6,
+        compression=CompressionMode.MESSAGE,
+    )
+    (path / 'metadata.yaml').unlink()
+    assert [p.n for p in read_bag(path, recover=True)] == [1000]
+
+
+@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3'])
+def test_a_file_that_somebody_compressed(tmp_path, name, monkeypatch):
+    want = record(5000)
+    write_bag(want, tmp_path / name)
+    packed = tmp_path / f'{name}.zst'
+    packed.write_bytes(ZstdCompressor().compress((tmp_path / name).read_bytes()))
+    (tmp_path / name).unlink()
+    monkeypatch.setenv('TMPDIR', str(tmp_path))
+    monkeypatch.setattr('tempfile.tempdir', None)
+    (piece,) = (got := read_bag(packed)).pieces
+    np.testing.assert_array_equal(piece.v, want.pieces[0].v)
+    assert not got.faults
+    # nothing stays behind
+    assert [f.name for f in tmp_path.iterdir()] == [packed.name]
+    for data in (packed.read_bytes()[: packed.stat().st_size // 2], b'', b'no zstd'):
+        packed.write_bytes(data)
+        with pytest.raises(DataError, match=packed.name):
+            read_bag(packed)
+    packed.write_bytes(b'')
+    monkeypatch.setitem(sys.modules, 'zstandard', None)
+    with pytest.raises(DataError, match='pip install zstandard'):
+        read_bag(packed)
 
 
 def test_two_stages_need_a_namespace(tmp_path):
