@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.record.clock import has_restarted
 
+#: a clock that goes ahead by more than this is another one: a day, the longest capture [s]
+LONGEST_GAP = 86_400.0
+
 
 class BlockClock:
     """
@@ -44,7 +47,7 @@ class BlockClock:
         Parameters
         ----------
         t : ndarray, shape (n,)
-            Its time stamps [s], finite.
+            Its time stamps [s], those of samples in a row.
 
         Returns
         -------
@@ -60,7 +63,8 @@ class BlockClock:
             self.begin, self.last = first, last
             return Kind.START, 0
         # a first block that comes twice ends where the stream ends: that is no restart
-        if last < before and has_restarted(first, before, self.begin, self.period):
+        is_back = last < before and has_restarted(first, before, self.begin, self.period)
+        if is_back or first - before > LONGEST_GAP:
             self.restarts += 1
             self.begin, self.last = first, last
             return Kind.START, 0

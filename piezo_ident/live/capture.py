@@ -83,7 +83,7 @@ class _Topic:
         self.stream, self.clock = BlockStream(), BlockClock()
         # counts of samples at which the clock restarted, and samples that are no longer kept
         self._runs: list[int] = []
-        self.dropped = self._newest = 0
+        self.dropped = self._newest = self.not_finite = 0
 
     def add(self, samples: Samples, arrival: int) -> None:
         """Take a block; where one with impossible times lies, the record will say."""
@@ -92,6 +92,7 @@ class _Topic:
             self.clock.judge(t)
             if self.clock.restarts > restarts:
                 self._runs.append(self.total)
+        self.not_finite += samples.not_finite
         self.stream.append(samples, arrival)
         self._newest = t.size
 
@@ -286,6 +287,8 @@ class Capture:
                 problems.append(f'{topic.clock.lost} samples of {key} are missing')
             if topic.clock.late:
                 problems.append(f'{topic.clock.late} samples of {key} came twice or out of turn')
+            if topic.not_finite:
+                problems.append(f'{topic.not_finite} samples of {key} are NaN or infinite')
         for key, (count, reason) in self._unreadable.items():
             problems.append(f'{count} messages on {key} are no blocks ({reason})')
         return tuple(problems)

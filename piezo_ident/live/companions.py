@@ -38,8 +38,6 @@ class Companion:
     def add(self, samples: Samples) -> None:
         """Keep a block; one whose time jumps back begins a new stream."""
         ticks = self._ticks(samples.t)
-        if not ticks:
-            return
         if ticks[0] <= self._newest or len(self._kept) > MOST:
             self._kept.clear()
         self._kept.update(zip(ticks, samples.values.tolist(), strict=True))
@@ -59,9 +57,5 @@ class Companion:
         return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
 
     def _ticks(self, t: NDArray[np.float64]) -> list[int]:
-        # a time that is no number, or of no clock, belongs to nothing
-        usable = np.isfinite(t) & (np.abs(t) < 1e9)
-        ticks: list[int] = (
-            np.rint(np.where(usable, t, -1.0) * self._rate).astype(np.int64).tolist()
-        )
+        ticks: list[int] = np.rint(t * self._rate).astype(np.int64).tolist()
         return ticks

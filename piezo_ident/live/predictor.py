@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ModelError
-from piezo_ident.common.kernel import kernel
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind
@@ -22,31 +21,12 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.record.blocks import Samples
+from piezo_ident.record.blocks import Samples, time_problem
 
 #: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
 BRIDGE = 0.5
-#: shortest sampling period that is accepted [s]
-SHORTEST = 1e-7
 #: share of the voltage range that counts as its lower end, where the memory is known
 REST = 0.01
-
-#: what may be wrong with a block
-FINE, NOT_FINITE, NOT_UNIFORM = range(3)
-
-
-@kernel
-def _fault(t: NDArray[np.float64], v: NDArray[np.float64]) -> int:
-    shortest, longest = np.inf, 0.0
-    for k in range(t.size):
-        if not (np.isfinite(t[k]) and np.isfinite(v[k])):
-            return NOT_FINITE
-        if k:
-            step = t[k] - t[k - 1]
-            shortest, longest = min(shortest, step), max(longest, step)
-    if t.size > 1 and not (shortest > 0.999 * SHORTEST and longest < 1.5 * shortest):
-        return NOT_UNIFORM
-    return FINE
 
 
 class Predictor:
@@ -163,7 +143,8 @@ class Predictor:
         elif kind is Kind.START:
             # a program that starts again starts at zero
             if clock.restarts and t[0] > 0.5 * clock.period:
-                self.problem = f'time jumps back from {last:.6g} to {t[0]:.6g} s'
+                way = 'back' if t[0] < last else 'ahead'
+                self.problem = f'time jumps {way} from {last:.6g} to {t[0]:.6g} s'
             self._clear()
         elif abs(clock.period / before - 1.0) > 1e-3:
             self.problem = f'the sampling rate changed at t = {t[0]:.6g} s'
@@ -176,24 +157,22 @@ class Predictor:
         return Samples(t, y, samples.segment, 'displacement')
 
     def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
-        if not t.size:
-            return False
-        fault = _fault(t, v)
-        if fault == NOT_FINITE:
+        if problem := time_problem(t):
+            self.problem = f'a block of voltage is left out: {problem}'
+        elif not np.isfinite(v).all():
             # counted when the gap that it leaves is met
             self.problem = (
                 f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
                 'it is left out'
             )
-        elif fault == NOT_UNIFORM:
-            self.problem = f'time is not uniform in the block at t = {t[0]:.6g} s; left out'
         elif t.size == 1 and np.isnan(self._clock.period):
             self.problem = (
                 f'the block at t = {t[0]:.6g} s is one sample, which tells no sampling rate; it '
                 'is left out'
             )
-            return False
-        return bool(fault == FINE)
+        else:
+            return True
+        return False
 
     def _bridge(self, t0: float, t1: float, v1: float, missing: int) -> None:
         self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'

@@ -26,7 +26,7 @@ import enum
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.record.blocks import Samples
+from piezo_ident.record.blocks import Samples, time_problem
 from piezo_ident.record.clock import has_restarted
 
 #: returns the ids of all publishers of a topic
@@ -170,11 +170,9 @@ class SampleClock:
         return verdict
 
     def _ticks(self, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
-        if not t.size:
-            return t, 'an empty block'
+        if problem := time_problem(t):
+            return t, problem
         position = t * self.sample_rate
-        if not (np.isfinite(position).all() and np.abs(position).max() < 2**53):
-            return t, 'its time stamps are not finite'
         ticks = np.rint(position)
         if np.abs(position - ticks).max() <= SLACK and np.all(np.diff(ticks) == 1):
             return ticks, ''

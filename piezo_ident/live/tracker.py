@@ -221,6 +221,20 @@ class Tracker:
         self._inverse.process(self._wanted)
 
 
+def held(x: Array, before: float) -> Array:
+    """
+    Return samples, each that is no number replaced by the one before it.
+
+    >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
+    [3.0, 1.0, 1.0]
+    """
+    good = np.isfinite(x)
+    if good.all():
+        return x
+    last = np.where(good, np.arange(1, x.size + 1), 0)
+    return np.append(before, x)[np.maximum.accumulate(last)]
+
+
 class _Join:
     """
     Joins a reference along a raised cosine.
@@ -249,7 +263,8 @@ class _Join:
 
     def process(self, x: Array) -> Array:
         """Return the next samples; one that is no number leaves the last one in force."""
-        x = self._finite(x)
+        x = held(x, self._command)
+        self._command = float(x[-1])
         if self._length < 0:
             before = 2.0 * x[0] - x[1] if self._moves and x.size > 1 else x[0]
             self._distance = self._start - float(before)
@@ -260,13 +275,4 @@ class _Join:
             self._done += x.size
             x = x + (self._distance if self._moves else self._start - x) * left
         self.last = float(x[-1])
-        return x
-
-    def _finite(self, x: Array) -> Array:
-        good = np.isfinite(x)
-        if not good.all():
-            x = np.append(self._command, x)
-            found = np.where(np.append(True, good), np.arange(x.size), 0)
-            x = x[np.maximum.accumulate(found)][1:]
-        self._command = float(x[-1])
         return x

@@ -20,7 +20,7 @@ the memory that it would have if it had run from the start.
 |---|---|---|
 | layout of no block, stamps off the clock, a block that came before, a second publisher, far \
 from the stage, as in micrometres | the block is refused | WARN |
-| a sample that is no number | the last one stays in force | |
+| a sample that is no number | the last one stays in force | WARN |
 | a gap up to `silence` | a straight line | WARN |
 | another stream | is joined from where the first one ended | |
 | out of reach | the voltage stays at its limit | WARN |
@@ -44,7 +44,7 @@ from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
-from piezo_ident.live.tracker import Drive, Successor, Tracker
+from piezo_ident.live.tracker import Drive, held, Successor, Tracker
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
@@ -56,6 +56,8 @@ from std_msgs.msg import Float64MultiArray
 
 #: parameters that are taken over between two references
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
+#: faults whose samples or blocks are counted
+FAULTS = ('lost', 'refused', 'not_finite', 'clipped')
 #: how long a stage may answer nothing to a reference that goes on, before it is told [s]
 SILENT = 1.0
 
@@ -186,6 +188,7 @@ class FeedforwardNode(DrivingNode):
         self._heard = 0
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._take_right(self._tracker)
+        self._last_value = self._tracker.inverse.position
         return self._tracker
 
     def _clear(self) -> None:
@@ -229,7 +232,10 @@ class FeedforwardNode(DrivingNode):
         if not verdict.is_taken:
             self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
-        x = samples.values
+        x = held(samples.values, self._last_value)
+        if bad := samples.not_finite:
+            about = 'samples of the reference are no numbers: the last one stays in force'
+            self._faults.note('not_finite', f'{bad} {about}', bad)
         if verdict.kind is Kind.GAP:
             self._faults.note('lost', verdict.reason, verdict.missing)
             share = np.arange(1, verdict.missing + 1) / (verdict.missing + 1)
@@ -244,7 +250,7 @@ class FeedforwardNode(DrivingNode):
             self._answered = self._last
         self._last_value, self._length = float(x[-1]), self._length + x.size
         if self._length <= self.values['longest'] * self._rate_of_clock:
-            self._kept.append(np.array(x))
+            self._kept.append(x.copy())
         tracker = self._tracker
         if tracker is not None:
             is_new = verdict.kind is Kind.START
@@ -277,15 +283,17 @@ class FeedforwardNode(DrivingNode):
         if self._state not in ('tracking', 'learning', 'stopping'):
             return
         try:
-            samples = from_message(message)
+            samples = from_message(message, 'displacement')
         except DataError as error:
             self._faults.note('refused', f'a block of displacement is refused: {error}')
             return
-        if samples.t.size and np.isfinite(samples.t).all():
-            self._answered = time.monotonic()
-            self._tell(self._error.measured(samples))
-            if self._learner is not None:
-                self._learner.measured(samples)
+        if bad := samples.not_finite:
+            about = 'samples of displacement are no numbers: left out of the tracking error'
+            self._faults.note('not_finite', f'{bad} {about}', bad)
+        self._answered = time.monotonic()
+        self._tell(self._error.measured(samples))
+        if self._learner is not None:
+            self._learner.measured(samples)
 
     def _tell(self, errors: list[Samples]) -> None:
         for block in errors:
@@ -356,8 +364,7 @@ class FeedforwardNode(DrivingNode):
         rate, worked = self._rate.of(self._counts['samples']), self._work_rate.of(self._busy)
         values: dict[str, object] = {
             'rate': f'{rate:.1f}',
-            **{name: self._counts[name] for name in ('samples', 'streams', 'lost', 'refused')},
-            'clipped': self._counts['clipped'],
+            **{name: self._counts[name] for name in ('samples', 'streams', *FAULTS)},
             'models': self._models,
             'publishers': self.count_publishers('voltage'),
         }

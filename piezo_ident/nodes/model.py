@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 import functools
 import time
 from typing import Any
@@ -42,7 +43,7 @@ class ModelNode(LabNode):
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
-        self._source, self._refusal, self._unreadable = '', '', 0
+        self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
@@ -97,13 +98,12 @@ class ModelNode(LabNode):
     def _on_block(self, topic: str, take: Any, message: Float64MultiArray) -> None:
         begin = time.perf_counter()
         try:
-            samples = from_message(message)
-            if samples.quantity != topic:
-                raise DataError(f"layout says 't,{samples.quantity}', not 't,{topic}'")
+            samples = from_message(message, topic)
         except DataError as error:
             self._unreadable += 1
             self._note_problem(f'a message on {topic} is no block: {error}')
             return
+        self._not_finite += samples.not_finite
         take(samples)
         self._work += time.perf_counter() - begin
 
@@ -117,13 +117,9 @@ class ModelNode(LabNode):
         if prediction is not None:
             self._prediction.publish(to_message(prediction))
         self._count += samples.t.size
-        if samples.t.size:
-            low, high = self._range
-            self._range = (
-                min(low, float(samples.values.min())),
-                max(high, float(samples.values.max())),
-            )
-            self._publish_preview(self._preview.add('voltage', samples.t, samples.values))
+        numbers, (low, high) = samples.values[np.isfinite(samples.values)], self._range
+        self._range = float(numbers.min(initial=low)), float(numbers.max(initial=high))
+        self._publish_preview(self._preview.add('voltage', samples.t, samples.values))
         if predictor.problem:
             self._note_problem(predictor.problem)
         if prediction is not None:
@@ -132,16 +128,12 @@ class ModelNode(LabNode):
             self._compare(self._matcher.predicted(prediction))
 
     def _displacement(self, samples: Samples) -> None:
-        if not samples.t.size:
-            return
-        usable = np.isfinite(samples.t) & np.isfinite(samples.values)
+        usable = np.isfinite(samples.values)
         if not usable.all():
             self._note_problem(
                 'a block of displacement holds NaN or infinite numbers; they are left out'
             )
-            samples = Samples(
-                samples.t[usable], samples.values[usable], samples.segment, samples.quantity
-            )
+            samples = replace(samples, t=samples.t[usable], values=samples.values[usable])
             if not samples.t.size:
                 return
         self._measured += samples.t.size
@@ -250,6 +242,7 @@ class ModelNode(LabNode):
             'late': p.late,
             'restarts': p.restarts,
             'unreadable': self._unreadable,
+            'not_finite': self._not_finite,
             'unmatched': self._matcher.unmatched,
             'unmeasured': self._matcher.unmeasured,
         }

@@ -8,7 +8,7 @@ from __future__ import annotations
 from array import array
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.blocks import decode, encode, Samples
+from piezo_ident.record.blocks import decode, encode, Samples, time_problem
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -55,15 +55,18 @@ def to_message(samples: Samples) -> Float64MultiArray:
     )
 
 
-def from_message(message: Float64MultiArray, quantity: str = '') -> Samples:
+def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     """
-    Return the block in a message, of a certain quantity where one is named.
+    Return the block in a message, of one of some quantities where they are named.
+
+    All nodes take their blocks from here, so what one of them refuses, all refuse.  A value may
+    be no number: each node says what it does then.
 
     Raises
     ------
     DataError
         When the layout is not that of a block, does not fit the data, or is larger than a block,
-        or the quantity is another.
+        the quantity is another, or the time stamps are not those of samples in a row.
     """
     dims, n = message.layout.dim, len(message.data)
     if n > 2 * MOST:
@@ -73,8 +76,10 @@ def from_message(message: Float64MultiArray, quantity: str = '') -> Samples:
     if any(len(d.label) > LONGEST for d in dims):
         raise DataError(f'a label of more than {LONGEST} characters')
     samples = decode(message.data, message.layout.dim, message.layout.data_offset)
-    if quantity and samples.quantity != quantity:
-        raise DataError(f'a block of {samples.quantity!r}, expected is {quantity}')
+    if quantities and samples.quantity not in quantities:
+        raise DataError(f'a block of {samples.quantity!r}, expected is {" or ".join(quantities)}')
+    if problem := time_problem(samples.t):
+        raise DataError(problem)
     return samples
 
 

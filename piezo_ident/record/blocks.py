@@ -30,6 +30,11 @@ from piezo_ident.record.record import Segment
 BLOCK_SIZE = 100
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5
+#: shortest sampling period of a block [s], that of 10 MHz, the highest rate of a node; and how far
+#: from zero its clock may be [s], 300 years, where a double still tells 2 us
+SHORTEST, LATEST = 1e-7, 1e10
+#: a longest step of so many shortest ones is that of a sample that is missing, not jitter (taste)
+UNEVEN = 1.5
 
 
 class Dimension(NamedTuple):
@@ -52,6 +57,11 @@ class Samples:
     values: Array
     segment: str = ''
     quantity: str = 'voltage'
+
+    @property
+    def not_finite(self) -> int:
+        """How many values are no numbers."""
+        return int(np.count_nonzero(~np.isfinite(self.values)))
 
 
 def encode(samples: Samples) -> tuple[Array, tuple[Dimension, Dimension]]:
@@ -108,6 +118,29 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
     return Samples(_on_ticks(matrix[:, 0]), matrix[:, 1], segment, quantity)
 
 
+@np.errstate(over='ignore', invalid='ignore')
+def time_problem(t: Array) -> str:
+    """
+    Return why the time stamps of a block [s] are not those of samples in a row, empty otherwise.
+
+    >>> time_problem(np.array([0.0, 0.1, 0.2])), time_problem(np.array([0.0, np.nan]))
+    ('', 'its time stamps are not finite, or more than 1e+10 s from zero')
+    """
+    if not t.size:
+        return 'an empty block'
+    step = np.diff(t)
+    # NaN passes no comparison
+    if not (abs(float(t[0])) < LATEST and abs(float(t[-1])) < LATEST and np.isfinite(step).all()):
+        return f'its time stamps are not finite, or more than {LATEST:g} s from zero'
+    low, high = (float(step.min()), float(step.max())) if step.size else (1.0, 1.0)
+    if 0.999 * SHORTEST < low and high < UNEVEN * low:
+        return ''
+    return (
+        f'its time stamps are not ticks of one rate in a row: steps of {low:.6g} to {high:.6g} s'
+    )
+
+
+@np.errstate(over='ignore', invalid='ignore')
 def _on_ticks(t: Array) -> Array:
     """Return times as ticks over their rate, where they are that but for rounding."""
     span = float(t[-1] - t[0]) if t.size > 1 else 0.0

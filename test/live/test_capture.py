@@ -273,3 +273,11 @@ def test_times_that_are_none_break_nothing(monkeypatch, time):
         capture.add('voltage', Samples(t, np.zeros(100), 'hold'), k)
     assert capture.n <= 101 * 100
     assert capture.last_time('voltage') == (100 * 299 - 1) / RATE
+
+
+def test_samples_that_are_no_numbers_are_counted_and_said():
+    capture, values = Capture(), np.zeros(100)
+    values[:25] = np.nan
+    for k in range(3):
+        capture.add('displacement', Samples(np.arange(100 * k, 100 * k + 100) / RATE, values), k)
+    assert capture.problems == ('75 samples of displacement are NaN or infinite',)

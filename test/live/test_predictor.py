@@ -408,7 +408,7 @@ def test_live_error_starts_afresh_behind_a_gap():
 def test_ragged_time_and_clocks_faster_than_any_card_are_left_out(t):
     predictor = Predictor()
     assert predictor.process(Samples(t, np.zeros(t.size))) is None
-    assert 'not uniform' in predictor.problem
+    assert 'not ticks of one rate' in predictor.problem
 
 
 def test_blocks_that_are_kept_are_bounded(monkeypatch):

@@ -6,9 +6,11 @@
 from pathlib import Path
 
 from attack import contradiction, odd_messages, start
-from course import level, paper
+from course import FS, level, paper
 from graph import Graph
+import numpy as np
 from piezo_ident.nodes.wire import SERVICE
+from piezo_ident.record.blocks import Samples, time_problem
 import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -62,7 +64,18 @@ def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
                 lambda said=said, node=node: any(said in s['text'] for s in g.statuses(node)),
                 f'{node} to say {said!r}',
             )
-    # nothing that was sent is said again at its length
+    ticks = np.arange(100) / FS
+    for t in (np.full(100, 1e300), ticks[::-1], np.delete(ticks, 50), ticks[:0]):
+        attack.send('voltage', Samples(t, np.zeros(t.size), 'strange'))
+        problem = time_problem(t)
+        for node in ('stage', 'model', 'identifier'):
+            g.wait(
+                lambda node=node, said=problem: any(said in s['text'] for s in g.statuses(node)),
+                f'{node} to say {problem!r}',
+            )
+    # no number of 300 digits, and nothing that was sent is said again at its length
+    assert max(len(s['text']) for s in g.statuses('identifier')) < 2000
+    assert 'Warning' not in g.handle('model').log + g.handle('identifier').log
     assert max(len(s['text']) for s in g.statuses('stage')) < 2000
     assert max(len(s['text']) for s in g.statuses('model')) < 4000
     g.wait(lambda: int(g.diagnostics('stage')['refused_malformed']) >= 15, 'refused blocks')

@@ -192,6 +192,7 @@ def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
         'expected is reference',
         'in metres?',
         'out of reach',
+        '2 samples of the reference are no numbers',
     )
     for what in told:
         assert any(what in text for text in said), (what, said)

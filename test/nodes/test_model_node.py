@@ -255,6 +255,7 @@ def test_faults_of_the_stream_are_said_and_survived(fast):
     fast.wait(lambda: fast.diagnostics('model') is not before, 'diagnostics')
     fast.wait(lambda: int(fast.diagnostics('model').get('lost', 0)) >= 200, 'lost samples')
     assert int(fast.diagnostics('model')['unreadable']) >= 1
+    assert int(fast.diagnostics('model')['not_finite']) >= 1
     assert int(fast.diagnostics('model')['late']) >= 200
     assert fast.status('model')['state'] == 'predicting'
 

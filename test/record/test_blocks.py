@@ -5,7 +5,7 @@
 
 import numpy as np
 from piezo_ident.common.errors import DataError
-from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples
+from piezo_ident.record.blocks import cut_blocks, decode, Dimension, encode, Samples, time_problem
 from piezo_ident.record.record import Segment
 import pytest
 
@@ -55,3 +55,34 @@ def test_no_block_spans_two_segments():
     assert got[:4] == [(0, 100, ''), (100, 130, ''), (130, 230, 'noise'), (230, 330, 'noise')]
     assert got[-1] == (1000, 1050, 'sine:50Hz')
     assert [b[0] for b in got[1:]] == [b[1] for b in got[:-1]]
+
+
+TICKS = np.arange(100) / 20e3
+
+
+@pytest.mark.parametrize('t', [TICKS, TICKS[:1], 1.7e9 + TICKS, TICKS - 1.0, 0.01 * TICKS])
+def test_times_of_samples_in_a_row(t):
+    assert time_problem(t) == ''
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    ('t', 'reason'),
+    [
+        (TICKS[:0], 'empty'),
+        (np.array([1e300]), 'not finite'),
+        (np.full(100, 1e300), 'not finite'),
+        (np.array([-1e308, 1e308]), 'not finite'),
+        (np.where(TICKS == TICKS[50], np.nan, TICKS), 'not finite'),
+        (np.where(TICKS == TICKS[50], np.inf, TICKS), 'not finite'),
+        (np.where(TICKS == TICKS[50], 1e300, TICKS), 'in a row'),
+        (TICKS[::-1], 'in a row'),
+        (np.zeros(100), 'in a row'),
+        (np.delete(TICKS, 50), 'in a row'),
+        (1e-9 * np.arange(100), 'in a row'),
+    ],
+)
+def test_times_that_are_none(t, reason):
+    assert reason in time_problem(t)
+    # and none of them breaks what reads them
+    decode(*encode(Samples(t, np.zeros(t.size))))
