@@ -2,22 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a node is given when it starts, on its command line or by a launch file.
+What a node is given, when it starts and while it runs: arguments and parameters.
 
-ROS passes over a parameter or an argument that nobody knows without a word.
+ROS passes over a parameter or an argument that nobody knows without a word.  Of several
+parameters in one request it judges each alone, against the old values of the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import difflib
 from pathlib import Path
 import re
 import sys
+from typing import Any
 
-from piezo_ident.common.errors import ConfigError
+from diagnostic_msgs.msg import DiagnosticStatus
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.nodes.journal import Journal, shown
+from piezo_ident.nodes.parameters import Declaration
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_service import ParameterService
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
@@ -65,3 +79,152 @@ def unknown_to(node: Node) -> Iterator[str]:
     rest = remove_ros_args(args=sys.argv)[1:]
     if rest:
         yield f'{" ".join(rest)} is passed over; set parameters by --ros-args -p NAME:=VALUE'
+
+
+class _Together(ParameterService):
+    """Lets the node judge all parameters of a request, as ``ros2 param load`` sends, at once."""
+
+    def _set_parameters_callback(
+        self, request: SetParameters.Request, response: SetParameters.Response
+    ) -> SetParameters.Response:
+        parameters = [Parameter.from_parameter_msg(p) for p in request.parameters]
+        response.results = self._get_node().set_parameters(parameters)
+        return response
+
+
+class ParameterNode(Node):
+    """
+    A node that declares its parameters by `Declaration`, and judges them together.
+
+    A subclass refuses values in `refuse` and acts on them in `apply`.
+
+    Attributes
+    ----------
+    values : dict
+        Of all parameters.
+    wanted : dict
+        The same as they would be with what is just being set.
+    journal : Journal
+    """
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, start_parameter_services=False, **kwargs)
+        self._parameter_service = _Together(self)
+        self.journal = Journal(self.get_logger())
+        self._declared: dict[str, Declaration] = {}
+        self.values: dict[str, Any] = {}
+        self.wanted: dict[str, Any] = {}
+
+    def _declare_all(self, declarations: Iterable[Declaration]) -> None:
+        for declaration in declarations:
+            self._declare(declaration)
+        self.add_on_set_parameters_callback(self._validate)
+        self.add_post_set_parameters_callback(self._take_over)
+
+    def _declare(self, declaration: Declaration) -> None:
+        default = declaration.default
+        unit = f' [{declaration.unit}]' if declaration.unit else ''
+        choices = f' ({" or ".join(declaration.choices)})' if declaration.choices else ''
+        descriptor = ParameterDescriptor(
+            description=f'{declaration.description}{unit}{choices}',
+            read_only=declaration.read_only,
+        )
+        if declaration.low is not None and declaration.high is not None:
+            low, high = declaration.low, declaration.high
+            if isinstance(default, float):
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=low, to_value=high)
+                ]
+            else:
+                descriptor.integer_range = [
+                    IntegerRange(from_value=int(low), to_value=int(high), step=1)
+                ]
+        value = list(default) if isinstance(default, tuple) else default
+        parameter = self.declare_parameter(declaration.name, value, descriptor)
+        self._declared[declaration.name] = declaration
+        self.wanted = {**self.values, declaration.name: parameter.value}
+        problem = self._problem(declaration.name, parameter.value)
+        if problem:
+            raise PiezoIdentError(f'{self.get_name()}: {problem}')
+        self.values[declaration.name] = parameter.value
+
+    def _problem(self, name: str, value: Any) -> str | None:
+        """Return what is wrong with a value, None when nothing is."""
+        declaration = self._declared.get(name)
+        if declaration is None:
+            return None
+        if declaration.choices and value not in declaration.choices:
+            return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
+        if isinstance(value, float) and value != value:
+            return f'{name} must be a number, got NaN'
+        try:
+            return self.refuse(name, value)
+        except PiezoIdentError as error:
+            return str(error)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters; those that cannot be changed may be set to what they are."""
+        result = self._set(parameter_list)
+        if not result.successful:
+            self.journal.tell(f'parameter refused: {result.reason}', DiagnosticStatus.WARN)
+        return result
+
+    def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
+        """
+        Set all parameters at once, or else each that can be set, in an order in which it can.
+
+        A file that is loaded moves limits that belong together, and names them one by one.
+        """
+        together = self._set(parameter_list)
+        if together.successful:
+            return [together] * len(parameter_list)
+        results: dict[int, SetParametersResult] = {}
+        left = list(range(len(parameter_list)))
+        while left:
+            results.update((k, self._set([parameter_list[k]])) for k in left)
+            refused = [k for k in left if not results[k].successful]
+            if len(refused) == len(left):
+                break
+            # what was just set may have been in the way of those
+            left = refused
+        for k in left:
+            self.journal.tell(f'parameter refused: {results[k].reason}', DiagnosticStatus.WARN)
+        return [results[k] for k in range(len(parameter_list))]
+
+    def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        # as a file does that is loaded and holds all
+        wanted = [
+            p
+            for p in parameters
+            if p.name not in self._declared
+            or not self._declared[p.name].read_only
+            or (p.type_, p.value) != (self.get_parameter(p.name).type_, self.values[p.name])
+        ]
+        if unknown := [p.name for p in wanted if not self.has_parameter(p.name)]:
+            return SetParametersResult(reason=no_parameter(self, unknown[0]))
+        if not wanted:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(wanted)
+
+    def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        # two that come at once may each fit what is there, and not each other
+        self.wanted = {**self.values, **{p.name: p.value for p in parameters}}
+        for parameter in parameters:
+            problem = self._problem(parameter.name, parameter.value)
+            if problem:
+                return SetParametersResult(successful=False, reason=problem)
+        return SetParametersResult(successful=True)
+
+    def _take_over(self, parameters: Sequence[Parameter]) -> None:
+        changed = {p.name: p.value for p in parameters if p.name in self._declared}
+        self.values.update(changed)
+        if changed:
+            self.journal.tell(f'set: {shown(changed)}')
+            self.apply(changed)
+
+    def refuse(self, name: str, value: Any) -> str | None:
+        """Return or raise why a value of a parameter cannot be taken, if so; see `wanted`."""
+        return None
+
+    def apply(self, changed: Mapping[str, Any]) -> None:
+        """Act on parameters that were set."""

@@ -10,7 +10,7 @@ the signals are taken by `piezo_ident.nodes.ending`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import logging
 import os
 from pathlib import Path
@@ -27,23 +27,15 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.given import begin, no_parameter, unknown_to
-from piezo_ident.nodes.journal import FromPackage, Journal, shortened, shown
-from piezo_ident.nodes.parameters import Declaration, NODES
+from piezo_ident.nodes.given import begin, ParameterNode, unknown_to
+from piezo_ident.nodes.journal import FromPackage, shortened, shown
+from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -65,7 +57,7 @@ def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettin
     )
 
 
-class LabNode(Node):
+class LabNode(ParameterNode):
     """
     A node of the graph.
 
@@ -79,113 +71,20 @@ class LabNode(Node):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(self.executable, **kwargs)
-        self._declared: dict[str, Declaration] = {}
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
-        self.journal = Journal(self.get_logger())
         logging.getLogger('piezo_ident').addHandler(FromPackage(self.journal))
-        self.values: dict[str, Any] = {}
-        #: all values as they would be with what is just being set
-        self.wanted: dict[str, Any] = {}
         # a timer of the ROS clock would stand still when somebody sets use_sim_time
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._status = self.create_publisher(DiagnosticStatus, '~/status', LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', PREVIEW)
-        for declaration in NODES[self.executable]:
-            self._declare(declaration)
-        self.add_on_set_parameters_callback(self._validate)
-        self.add_post_set_parameters_callback(self._take_over)
+        self._declare_all(NODES[self.executable])
         self.create_timer(1.0, self._publish_diagnostics)
         self.report_status('idle', 0.0, 'ready')
 
     def create_timer(self, *args: Any, **kwargs: Any) -> Any:
         """Create a timer that goes by the clock of the machine, whatever ROS time does."""
         return super().create_timer(*args, **{'clock': self._steady, **kwargs})
-
-    # parameters
-
-    def _declare(self, declaration: Declaration) -> None:
-        default = declaration.default
-        unit = f' [{declaration.unit}]' if declaration.unit else ''
-        choices = f' ({" or ".join(declaration.choices)})' if declaration.choices else ''
-        descriptor = ParameterDescriptor(
-            description=f'{declaration.description}{unit}{choices}',
-            read_only=declaration.read_only,
-        )
-        if declaration.low is not None and declaration.high is not None:
-            low, high = declaration.low, declaration.high
-            if isinstance(default, float):
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=low, to_value=high)
-                ]
-            else:
-                descriptor.integer_range = [
-                    IntegerRange(from_value=int(low), to_value=int(high), step=1)
-                ]
-        value = list(default) if isinstance(default, tuple) else default
-        parameter = self.declare_parameter(declaration.name, value, descriptor)
-        self._declared[declaration.name] = declaration
-        self.wanted = {**self.values, declaration.name: parameter.value}
-        problem = self._problem(declaration.name, parameter.value)
-        if problem:
-            raise PiezoIdentError(f'{self.get_name()}: {problem}')
-        self.values[declaration.name] = parameter.value
-
-    def _problem(self, name: str, value: Any) -> str | None:
-        """Return what is wrong with a value, None when nothing is."""
-        declaration = self._declared.get(name)
-        if declaration is None:
-            return None
-        if declaration.choices and value not in declaration.choices:
-            return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
-        if isinstance(value, float) and value != value:
-            return f'{name} must be a number, got NaN'
-        try:
-            return self.refuse(name, value)
-        except PiezoIdentError as error:
-            return str(error)
-
-    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters; those that cannot be changed may be set to what they are."""
-        # as a file does that is loaded and holds all
-        wanted = [
-            p
-            for p in parameter_list
-            if p.name not in self._declared
-            or not self._declared[p.name].read_only
-            or (p.type_, p.value) != (self.get_parameter(p.name).type_, self.values[p.name])
-        ]
-        result = SetParametersResult(successful=True)
-        if unknown := [p.name for p in wanted if not self.has_parameter(p.name)]:
-            result = SetParametersResult(reason=no_parameter(self, unknown[0]))
-        elif wanted:
-            result = super().set_parameters_atomically(wanted)
-        if not result.successful:
-            self.journal.tell(f'parameter refused: {result.reason}', WARN)
-        return result
-
-    def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        # two that come at once may each fit what is there, and not each other
-        self.wanted = {**self.values, **{p.name: p.value for p in parameters}}
-        for parameter in parameters:
-            problem = self._problem(parameter.name, parameter.value)
-            if problem:
-                return SetParametersResult(successful=False, reason=problem)
-        return SetParametersResult(successful=True)
-
-    def _take_over(self, parameters: Sequence[Parameter]) -> None:
-        changed = {p.name: p.value for p in parameters if p.name in self._declared}
-        self.values.update(changed)
-        if changed:
-            self.journal.tell(f'set: {shown(changed)}')
-            self.apply(changed)
-
-    def refuse(self, name: str, value: Any) -> str | None:
-        """Return or raise why a value of a parameter cannot be taken, if so; see `wanted`."""
-        return None
-
-    def apply(self, changed: Mapping[str, Any]) -> None:
-        """Act on parameters that were set."""
 
     # status, diagnostics, services
 

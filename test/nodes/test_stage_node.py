@@ -6,14 +6,16 @@
 from dataclasses import replace
 
 from course import block, column, FS, level
-from graph import Graph
+from graph import Graph, ROOT
 import numpy as np
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import Samples
 import pytest
+from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import Float64MultiArray
+import yaml
 
 SETTINGS = GuardSettings(0.0, 10.0, 40000.0, 20.0, 0.0, FS)
 
@@ -217,6 +219,44 @@ def test_limits_and_slew_may_be_set_and_hold_at_once(lab):
     finally:
         assert lab.set('stage', 'voltage_high', 10.0)[0]
         assert lab.set('stage', 'slew', 40000.0)[0]
+
+
+def test_a_file_is_loaded_whatever_the_node_holds(lab):
+    # as ros2 param load sends it: all at once, each to be judged for itself
+    client = AsyncParameterClient(lab.node, '/stage')
+    lab.wait(client.services_are_ready, 'the services')
+    told = len(lab.handle('stage').log)
+
+    def load(values):
+        path = lab.folder / 'load.yaml'
+        text = yaml.safe_dump({'/stage': {'ros__parameters': values}}, sort_keys=False)
+        path.write_text(text)
+        future = client.load_parameter_file(str(path))
+        lab.wait(future.done, 'the answer')
+        results = zip(values, future.result().results, strict=True)
+        refused = {name: result.reason for name, result in results if not result.successful}
+        return refused, {name: lab.get('stage', name) for name in values}
+
+    high = {'voltage_low': 20.0, 'voltage_high': 150.0, 'rest': 50.0}
+    low = {'voltage_low': -30.0, 'voltage_high': 10.0, 'rest': 0.0}
+    before = {name: lab.get('stage', name) for name in high}
+    try:
+        for wanted in (high, low, high):
+            assert load(wanted) == ({}, wanted)
+        shipped = yaml.safe_load((ROOT / 'config' / 'stage.yaml').read_text())
+        (shipped,) = (x['ros__parameters'] for x in shipped.values())
+        # its seed is another, and can be given at the start only; that is no reason for the rest
+        refused, now = load({**shipped, 'silence': 600.0})
+        assert set(refused) == {'seed'} and 'seed' in refused['seed'], refused
+        assert now == {**shipped, 'silence': 600.0, 'seed': 3}
+        # what was in the way for a moment is no refusal
+        said = lab.handle('stage').log[told:].splitlines()
+        assert all('seed' in line for line in said if 'refused' in line), said
+        refused, now = load({**high, 'voltage_low': 200.0})
+        assert refused and 'voltage_low' in refused
+        assert now['voltage_low'] == 0.0
+    finally:
+        assert load(before) == ({}, before)
 
 
 def test_a_restart_of_the_same_publisher_and_a_very_long_gap(lab):
