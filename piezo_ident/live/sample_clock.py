@@ -13,6 +13,8 @@ the count of its publisher, and which publishers there are.  So:
 - while the publisher that was there at the start is the only one, every message is its own;
 - beside another one only a message with the next number is its own, and only while no other
   publisher is known to be at that number; without numbers, only one with the next time;
+- where another one is at that number and at that time, as one that started at the same moment,
+  nobody can tell whose a message is, and it is refused;
 - behind a silence the publisher may come back, and another one once the first has gone, or behind
   `SampleClock.end`.
 """
@@ -119,6 +121,8 @@ class SampleClock:
         self._again: int | None = None
         self._seen: deque[tuple[int, bytes]] = deque(maxlen=MEMORY)
         self._holes: deque[tuple[int, int]] = deque(maxlen=MEMORY)
+        #: next number and tick of the other publishers that have sent beside this stream
+        self._rivals: deque[tuple[int, int]] = deque(maxlen=MEMORY)
 
     def skip(self, sequence: int | None) -> None:
         """Count a message that holds no block."""
@@ -149,6 +153,8 @@ class SampleClock:
         tick, n = int(ticks[0]), samples.t.size
         if self._is_foreign(tick, sequence, publishers):
             self._note_other(sequence)
+            if sequence is not None:
+                self._rivals.append((sequence + 1, tick + n))
             return Verdict(
                 Kind.SECOND,
                 tick,
@@ -213,7 +219,7 @@ class SampleClock:
                 # the others have gone
                 (self._owner,) = ids
                 self._is_alone = True
-            return False
+            return not self._is_alone and (sequence, tick) in self._rivals
         if self._is_alone and (not ids or set(ids) == {self._owner}):
             return False
         if self._owner is not None and ids and self._owner not in ids:

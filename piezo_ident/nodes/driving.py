@@ -88,6 +88,7 @@ class DrivingNode(LabNode):
             elif self._state == 'stopping':
                 self._ramp()
             else:
+                self._output.refuse_foreign_blocks()
                 self.work()
         except PiezoIdentError as error:
             self._halt('failed', str(error))

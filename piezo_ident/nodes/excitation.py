@@ -18,7 +18,8 @@ their own: `voltage_b` for axis `b`.  All of them begin, end and stop together.
 Two programs at once would tear the stage to and fro, so a second publisher on `voltage` is
 refused at the start, and reported when it comes later.  An excitation that was killed is seen by
 the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
-for that.  Before the first block this node therefore listens for half a second.
+for that.  Before the first block this node therefore listens for half a second.  Two that start
+at the same moment, as two of one name do, hear each other in their first second, and both end.
 """
 
 from __future__ import annotations
@@ -258,6 +259,8 @@ class ExcitationNode(LabNode):
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
             self._sleep(playing, clock.due(start))
             self._send(playing, [axis.v[start:stop] for axis in playing.sequences], label)
+            for output in self._outputs:
+                output.refuse_foreign_blocks()
             clock.note(start, stop - start, time.monotonic())
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
             percent = math.floor(100.0 * stop / sequence.n)
@@ -318,7 +321,7 @@ class ExcitationNode(LabNode):
         foreign = [
             f'{who} on {self._quantity}{tail}'
             for tail, output in zip(self._tails, self._outputs, strict=True)
-            for who in output.others()
+            for who in sorted({*output.others(), output.second()} - {''})
         ]
         self._second = f'second publisher {foreign[0]}' if foreign else ''
         values: dict[str, object] = {'publishers': self.count_publishers(self._output.topic)}

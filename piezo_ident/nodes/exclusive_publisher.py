@@ -1,16 +1,23 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The right to drive: a publisher that sends only where nobody else does."""
+"""
+The right to drive: a publisher that sends only where nobody else does.
+
+A publisher is known by its id, not by its name: two nodes may have the same one.  The middleware
+does not tell which publisher sent a message.  But each listener gets a message once, so whoever
+hears more messages than it has sent hears somebody else.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.nodes.subscriptions import between_turns
-from piezo_ident.nodes.wire import STREAM, to_message
+from piezo_ident.nodes.subscriptions import between_turns, unspun
+from piezo_ident.nodes.wire import publishers, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -22,6 +29,8 @@ LISTEN = 0.5
 MEET = 2.0
 #: how long it takes a new node to know of most others [s]
 YOUTH = 1.0
+#: how long two that ask for it at the same moment may take to hear each other's first blocks [s]
+TOGETHER = 1.0
 #: between the match of a subscriber and the first block, for the other side to know of it too [s]
 SETTLE = 0.1
 
@@ -50,9 +59,10 @@ class ExclusivePublisher:
         self.topic = node.resolve_topic_name(topic)
         self._publisher: Any = self._created() if stays else None
         self._listener: Any = None
+        self._lock = threading.Lock()
         self._begin = self._met = self._free = 0.0
-        self._heard = False
-        self._known: set[str] = set()
+        self._sent = self._heard = 0
+        self._known: dict[bytes, str] = {}
 
     @property
     def is_open(self) -> bool:
@@ -73,12 +83,11 @@ class ExclusivePublisher:
         """
         self._refuse_others()
         self.stop_listening()
-        self._begin, self._met, self._free, self._heard = time.monotonic(), 0.0, 0.0, False
+        self._begin, self._met, self._free = time.monotonic(), 0.0, 0.0
+        self._sent = self._heard = 0
         if self._publisher is None:
             self._publisher = self._created()
-        self._listener = self._node.create_subscription(
-            Float64MultiArray, self.topic, self._on_other, STREAM
-        )
+        self._listener = unspun(self._node, Float64MultiArray, self.topic, raw=True)
 
     def poll(self, subscribers: int, limit: float) -> bool:
         """
@@ -90,12 +99,9 @@ class ExclusivePublisher:
             When somebody else drives, or too few listen within the limit [s].
         """
         now = time.monotonic()
+        self.refuse_foreign_blocks()
         if self._free:
             return now > self._free
-        if self._heard:
-            # without a name among the others it is that of this node
-            names = ', '.join(self.others()) or f'another {self._node.get_fully_qualified_name()}'
-            raise ConfigError(f'{names} drives {self.topic} now; end it first')
         if not self._met:
             self._await_publishers(now)
             return False
@@ -111,9 +117,37 @@ class ExclusivePublisher:
                     f'{limit:g} s; start the stage, or set subscribers or wait_limit'
                 )
             return False
-        between_turns(self._node, self.stop_listening)
-        self._known, self._free = set(self.others()), now + SETTLE
+        self._known, self._free = publishers(self._node, self.topic), now + SETTLE
         return False
+
+    def refuse_foreign_blocks(self) -> None:
+        """
+        Look for blocks of somebody else; from the thread that sends.
+
+        While the right to drive is waited for, and for `TOGETHER` after it was given: two that
+        ask for it at the same moment hear each other only when both send.
+
+        Raises
+        ------
+        ConfigError
+            When there are any.
+        """
+        with self._lock:
+            listener = self._listener
+            # one is enough: somebody may send faster than they are taken
+            while listener and self._heard <= self._sent:
+                if listener.handle.take_message(Float64MultiArray, True) is None:
+                    break
+                self._heard += 1
+        if listener and self._heard > self._sent:
+            self.stop_listening()
+            own, others = self._node.get_fully_qualified_name(), self.others()
+            names = list(publishers(self._node, self.topic).values())
+            if names.count(own) > 1 or not others:
+                others.append(f'another {own}')
+            raise ConfigError(f'{" or ".join(others)} drives {self.topic} now; end it first')
+        if listener and self._free and time.monotonic() > self._free + TOGETHER:
+            self.stop_listening()
 
     def _await_publishers(self, now: float) -> None:
         """Note when every publisher is matched: silence before says nothing."""
@@ -133,25 +167,25 @@ class ExclusivePublisher:
 
     def send(self, samples: Samples) -> None:
         """Send a block."""
+        self._sent += 1
         self._publisher.publish(to_message(samples))
 
     def others(self) -> list[str]:
         """Return the other publishers; a namesake may be one that was killed."""
         own = self._node.get_fully_qualified_name()
-        infos = self._node.get_publishers_info_by_topic(self.topic)
-        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos]
-        return sorted({name for name in names if name != own})
+        return sorted(set(publishers(self._node, self.topic).values()) - {own})
 
     def second(self) -> str:
         """Return a publisher that came since the right was given, empty without one."""
-        new = set(self.others()) - self._known if self._free else set()
-        return min(new, default='')
+        now = publishers(self._node, self.topic) if self._free else {}
+        return min((name for gid, name in now.items() if gid not in self._known), default='')
 
     def stop_listening(self) -> None:
-        """Drop the listener, by the executor: it would get every block that this node sends."""
-        if self._listener is not None:
-            self._node.destroy_subscription(self._listener)
-            self._listener = None
+        """Drop the listener, between two turns of the executor: it gets all that is sent here."""
+        with self._lock:
+            listener, self._listener = self._listener, None
+        if listener is not None:
+            between_turns(self._node, lambda: self._node.destroy_subscription(listener))
 
     def close(self) -> None:
         """Give the right to drive back."""
@@ -161,6 +195,3 @@ class ExclusivePublisher:
             if not self._stays:
                 self._node.destroy_publisher(self._publisher)
                 self._publisher = None
-
-    def _on_other(self, _: Float64MultiArray) -> None:
-        self._heard = True

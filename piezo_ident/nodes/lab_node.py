@@ -154,7 +154,9 @@ class LabNode(ParameterNode):
         own = (self.get_name(), self.get_namespace())
         if self.get_node_names_and_namespaces().count(own) > 1:
             name = self.get_fully_qualified_name()
-            self.journal.warn(f'another node is called {name} too, or was until it was killed')
+            twin = f'another node is called {name} too, or was until it was killed'
+            self.journal.warn(twin)
+            level, message = max(level, WARN), f'{message}; {twin}'
         array = DiagnosticArray(status=[self._diagnostic(level, message, values)])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)

@@ -28,6 +28,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from std_msgs.msg import Float64MultiArray
@@ -106,6 +107,14 @@ def qos_of(*, reliable: bool = True, latched: bool = False, depth: int = DEPTH) 
     )
 
 
+def unspun(
+    node: Node, kind: Any, topic: str, profile: QoSProfile | None = None, *, raw: bool = False
+) -> Subscription:
+    """Return a subscription that the executor leaves alone: its owner takes the messages."""
+    group, profile = _NotSpun(), profile or qos_of()
+    return node.create_subscription(kind, topic, _ignore, profile, callback_group=group, raw=raw)
+
+
 class BlockSubscriptions:
     """
     Topics of blocks that are collected.
@@ -121,15 +130,11 @@ class BlockSubscriptions:
         self, node: Node, take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None]
     ) -> None:
         self._node, self._take = node, take
-        self._group = _NotSpun()
         self._subscriptions: dict[str, tuple[str, Any]] = {}
 
     def add(self, topic: str, key: str) -> None:
         """Subscribe to one more topic."""
-        subscription = self._node.create_subscription(
-            Float64MultiArray, topic, _ignore, qos_of(), callback_group=self._group
-        )
-        self._subscriptions[topic] = (key, subscription)
+        self._subscriptions[topic] = (key, unspun(self._node, Float64MultiArray, topic))
 
     @property
     def unpublished(self) -> list[str]:
@@ -205,7 +210,6 @@ class RawSubscriptions:
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
         self._node = node
         self._topics = {name: _Topic(name) for name in topics}
-        self._group = _NotSpun()
         self._lock = threading.Lock()
         self._closed = False
         self._clock = ArrivalClock()
@@ -288,9 +292,7 @@ class RawSubscriptions:
                 return
             self._destroy(topic)
             topic.problem = ''
-            topic.subscription = self._node.create_subscription(
-                message, name, _ignore, request.profile(), callback_group=self._group, raw=True
-            )
+            topic.subscription = unspun(self._node, message, name, request.profile(), raw=True)
 
     def _destroy(self, topic: _Topic) -> None:
         subscription, topic.subscription = topic.subscription, None

@@ -83,9 +83,17 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     return samples
 
 
+def publishers(node: Node, topic: str) -> dict[bytes, str]:
+    """Return the full name of the node of each publisher of a topic by the publisher's gid."""
+    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    return {
+        bytes(info.endpoint_gid): f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+        for info in infos
+    }
+
+
 def publisher_ids(node: Node, subscription: Subscription) -> list[bytes]:
     """Return the gids of all publishers of the topic of a subscription."""
-    infos = node.get_publishers_info_by_topic(subscription.topic_name)
-    gids = [bytes(info.endpoint_gid) for info in infos]
+    gids = list(publishers(node, subscription.topic_name))
     # one that is matched may not be listed yet
     return gids + [b'unlisted'] * max(0, subscription.get_publisher_count() - len(gids))

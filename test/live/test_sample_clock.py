@@ -6,6 +6,7 @@
 import math
 
 import numpy as np
+from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.record.blocks import Samples
 import pytest
@@ -178,3 +179,27 @@ def test_a_loss_beside_a_second_publisher_ends_the_stream(clock):
     # once it is alone again a loss is a gap
     assert clock.judge(block(200), 9, lambda: [b'A']).kind is Kind.NEXT
     assert clock.judge(block(500), 12, lambda: [b'A']).kind is Kind.GAP
+
+
+@pytest.mark.parametrize('burst', [1, 3])
+def test_nobody_drives_where_two_of_one_number_and_time_cannot_be_told_apart(clock, burst):
+    taken = []
+    for k in range(0, 30, burst):
+        for value in (1.0, 2.0):
+            for j in range(k, k + burst):
+                verdict = clock.judge(block(100 * j, value=value), 41 + j, two)
+                taken += [value] if verdict.is_taken else []
+    # what came before anybody could know, and nothing torn
+    assert taken == [1.0] * burst
+    clock.pause()
+    clock.end()
+    assert clock.judge(block(3000), 71, lambda: [b'A']).kind is Kind.START
+    # a number and a time at which another one has been in an earlier stream say nothing
+    assert clock.judge(block(3100), 72, lambda: [b'A']).kind is Kind.NEXT
+
+
+def test_a_clock_that_goes_ahead_by_more_than_a_day_is_another_one():
+    clock, t = BlockClock(), np.arange(100) / FS
+    steps = [t, t + 0.01, t + 1e9, t + 0.01]
+    assert [clock.judge(x)[0].value for x in steps] == ['start', 'gap', 'start', 'start']
+    assert (clock.lost, clock.restarts) == (100, 2)

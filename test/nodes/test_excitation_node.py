@@ -267,6 +267,37 @@ def test_nobody_listens_somebody_else_talks_and_what_comes_too_late():
         )
 
 
+def test_of_two_of_one_name_that_start_at_once_one_drives_at_most():
+    with Graph() as g:
+        applied = g.collect('applied_voltage')
+        _, *twins = g.start_all(
+            ('stage', {'seed': 3}),
+            ('excitation', {'program': SHORT}),
+            ('excitation', {'program': HIGH}),
+        )
+        g.matched('applied_voltage')
+
+        def both_hear():
+            assert not g.call('excitation/stop')[0]
+            return all('nothing is being played' in twin.log for twin in twins)
+
+        g.wait(both_hear, 'a call to reach both')
+        twin = 'another node is called /excitation too'
+        g.wait(lambda: twin in g.diagnostics('excitation').get('message', ''), 'the namesake')
+        assert g.diagnostics('excitation')['level'] == '1'
+        assert g.call('excitation/start')[0]
+
+        def given_way():
+            return [t for t in twins if 'another /excitation drives /voltage now' in t.log]
+
+        # one of them where it has heard the other before its own first block, else both
+        g.wait(given_way, 'one to give way')
+        failed = [s for s in g.statuses('excitation') if s['state'] == 'failed']
+        assert failed and all('end it first' in s['text'] for s in failed)
+        if applied:
+            assert np.abs(np.diff(column(applied)[1])).max() * FS <= 40_000.0 * (1 + 1e-9)
+
+
 def test_bad_parameters_at_the_start_end_it_with_the_reason():
     with Graph() as g:
         nodes = [

@@ -73,7 +73,8 @@ def test_two_excitations_on_one_topic(lab):
     twin = lab.start('excitation', {'program': HIGH}, remaps=own, wait=False)
     lab.wait(
         lambda: any(
-            d['message'] == 'nothing played yet' and d['publishers'] == '2'
+            d['message'].startswith('nothing played yet; another node is called /excitation')
+            and d['publishers'] == '2'
             for d in lab.diagnoses('excitation')
         ),
         'the twin to know that it is not alone',
