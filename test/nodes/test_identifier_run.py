@@ -59,6 +59,8 @@ def test_run_drives_the_excitation_and_identifies(measured):
     assert states.index('exciting') < states.index('identifying') < states.index('done')
     course.wait(lambda: course.texts('model'), 'the model')
     assert course.diagnostics('identifier')['lost'] == '0'
+    # the next start is not of what the identifier wanted
+    assert course.get('excitation', 'program') == 'identification'
 
 
 def settling(g):

@@ -1,7 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The identifier's client of the excitation: set its program, start it, follow it to the end."""
+"""
+The identifier's client of the excitation: set its program, start it, follow it to the end.
+
+The excitation gets back the program that it had as soon as it has answered to the start, or the
+next ``~/start`` would play what somebody else had asked for.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.nodes.wire import LATCHED, SERVICE
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -26,7 +32,7 @@ _UNHEARD = 'unheard'
 _TAIL = 1.0
 #: how long a stage that warns may leave the voltage unanswered [s]: a rate that it refuses, say
 _UNANSWERED = 3.0
-#: after how long a program that is not acknowledged is set once more [s]
+#: after how long a request that is not answered is sent once more [s]
 _AGAIN = 2.0
 
 
@@ -61,10 +67,11 @@ class ExcitationClient:
         self._streams, self._missing = streams, missing
         self._begin: Callable[[], None] = _nothing
         self._ended: Callable[[str | None], None] = _nothing
-        self._set, self._start, self._stop = (
+        self._set, self._get, self._start, self._stop = (
             node.create_client(kind, f'excitation/{name}', qos_profile=SERVICE)
             for kind, name in (
                 (SetParameters, 'set_parameters'),
+                (GetParameters, 'get_parameters'),
                 (Trigger, 'start'),
                 (Trigger, 'stop'),
             )
@@ -73,7 +80,11 @@ class ExcitationClient:
         node.create_subscription(DiagnosticStatus, 'stage/status', self._hear_stage, LATCHED)
         self._phase = self._trouble = ''
         self._future: Any = None
+        # the client and the request of the future, and when it was sent
+        self._asks: tuple[Any, Any] = (None, None)
         self._asked = 0.0
+        # the program that the excitation had, as long as it has another one
+        self._before: Any = None
         self._state, self._message = '', ''
         self.progress = 0.0
 
@@ -125,8 +136,19 @@ class ExcitationClient:
         is_started = self._phase in ('starting', 'playing') and self._stop.service_is_ready()
         if is_started:
             self._stop.call_async(Trigger.Request())
-        self._phase = ''
+        phase, self._phase = self._phase, ''
+        if phase == 'starting' and self._future is not None:
+            # not before it has begun with the other one
+            self._future.add_done_callback(self._give_back)
+        elif phase in ('setting', 'starting'):
+            self._give_back()
         return is_started
+
+    def _give_back(self, *_: object) -> None:
+        """Set the program that the excitation had; later, where another run has begun already."""
+        if self._before is not None and self._phase not in ('setting', 'starting'):
+            self._set.call_async(_program(self._before))
+            self._before = None
 
     def _end(self, reason: str | None) -> None:
         if reason is not None:
@@ -168,8 +190,8 @@ class ExcitationClient:
         ready = self._set.service_is_ready() and self._start.service_is_ready()
         missing = self._missing() if ready else ''
         if ready and not missing:
-            self._phase, self._sign = 'setting', time.monotonic()
-            self._set_program()
+            self._phase, self._sign = 'asking', time.monotonic()
+            self._send(self._get, GetParameters.Request(names=['program']))
         elif missing and self._silent():
             self._end(f'no publisher of {missing} within {self._limit:g} s; start the stage')
         elif self._silent():
@@ -178,19 +200,33 @@ class ExcitationClient:
                 'it in this namespace, or remap that name'
             )
 
-    def _set_program(self) -> None:
-        parameter = Parameter('program', value=self._program).to_parameter_msg()
-        if self._future is not None:
-            self._set.remove_pending_request(self._future)
-        self._future = self._set.call_async(SetParameters.Request(parameters=[parameter]))
-        self._asked = time.monotonic()
+    def _send(self, client: Any, request: Any) -> None:
+        self._future, self._asked = client.call_async(request), time.monotonic()
+        self._asks = client, request
+
+    def _insisted(self, doing: str) -> Any:
+        """Return the response to what was sent; without one, send it again after a time."""
+        response = self._response(doing)
+        # a request is lost before both sides have matched; asking twice is harmless
+        if response is None and self.running and time.monotonic() - self._asked > _AGAIN:
+            client, request = self._asks
+            client.remove_pending_request(self._future)
+            self._send(client, request)
+        return response
+
+    def _asking(self) -> None:
+        response = self._insisted('telling its program')
+        if response is None:
+            return
+        if self._before is None and response.values:
+            self._before = response.values[0]
+        self._phase, self._sign = 'setting', time.monotonic()
+        value = Parameter('program', value=self._program).get_parameter_value()
+        self._send(self._set, _program(value))
 
     def _setting(self) -> None:
-        response = self._response('taking the program')
+        response = self._insisted('taking the program')
         if response is None:
-            # a request is lost before both sides have matched; setting twice is harmless
-            if self.running and time.monotonic() - self._asked > _AGAIN:
-                self._set_program()
             return
         result = response.results[0]
         if not result.successful:
@@ -206,13 +242,14 @@ class ExcitationClient:
         response = self._response('starting')
         if response is None:
             return
+        # whatever it plays where it refuses is not this node's to stop
+        self._phase = 'playing' if response.success else 'refused'
+        self._give_back()
         if not response.success:
-            # whatever it plays is not this node's to stop
-            self._phase = 'refused'
             self._end(f'the excitation does not start: {response.message}')
             return
         self._begin()
-        self._phase, self._sign = 'playing', time.monotonic()
+        self._sign = time.monotonic()
         # the status may have come before the answer
         self._active = self._state not in (*_RESTING, _UNHEARD)
 
@@ -257,6 +294,11 @@ class ExcitationClient:
         elif self._silent():
             last = f' (last: {self._state}, {self._message})' if self._state != _UNHEARD else ''
             self._end(f'no status of the excitation for {self._limit:g} s{last}')
+
+
+def _program(value: Any) -> SetParameters.Request:
+    """Return the request that sets the program of the excitation."""
+    return SetParameters.Request(parameters=[ParameterMessage(name='program', value=value)])
 
 
 def _moved(time: float, before: float) -> bool:

@@ -13,11 +13,14 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from piezo_ident.nodes.identifier import excitation_client
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient, Streams
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+BEFORE = Parameter('program', value='mine').get_parameter_value()
 ANSWERS = {
+    GetParameters: GetParameters.Response(values=[BEFORE]),
     SetParameters: SetParameters.Response(results=[SetParametersResult(successful=True)]),
     Trigger: Trigger.Response(success=True),
 }
@@ -30,17 +33,19 @@ class Client:
 
     def __init__(self, kind, dropped):
         self.kind, self.dropped = kind, dropped
-        self.calls, self.waited_for = 0, set()
+        self.calls, self.waited_for, self.requests = 0, set(), []
+        self.answer = ANSWERS[kind]
 
     def service_is_ready(self):
         return True
 
     def call_async(self, request):
         self.calls += 1
+        self.requests.append(request)
         future = Future()
         self.waited_for.add(future)
         if self.calls > self.dropped:
-            future.set_result(ANSWERS[self.kind])
+            future.set_result(self.answer)
         return future
 
     def remove_pending_request(self, future):
@@ -76,16 +81,43 @@ def test_a_program_that_is_not_acknowledged_is_set_again(monkeypatch, dropped, r
     while client.running and not begun and time.monotonic() < give_up:
         client.poll()
         time.sleep(0.001)
-    setter, starter, _ = node.clients
+    setter, _, starter, _ = node.clients
     if reason is None:
         # started once, when the program is set
         assert begun == [True] and ends == []
-        assert (setter.calls, starter.calls) == (3, 1)
+        assert (setter.calls, starter.calls) == (4, 1)
     else:
         assert begun == [] and reason in ends[0]
         assert setter.calls > 2 and starter.calls == 0
-    # requests that were given up are forgotten
-    assert len(setter.waited_for) == 1
+    # requests that were given up are forgotten; one of those left gives the program back
+    assert len(setter.waited_for) == 2
+    assert programs(setter)[-2:] == ['a program', 'mine']
+
+
+def programs(setter):
+    """Return the programs that were set, in order."""
+    return [r.parameters[0].value.string_value for r in setter.requests]
+
+
+@pytest.mark.parametrize('how', ['started', 'refused', 'cancelled'])
+def test_the_excitation_gets_its_program_back(how):
+    node, ends, nan = Node(0), [], float('nan')
+    client = ExcitationClient(node, lambda: Streams(0, nan, nan), lambda: '')
+    setter, _, starter, _ = node.clients
+    starter.answer = Trigger.Response(success=how != 'refused', message='somebody drives')
+    starter.dropped = 1 if how == 'cancelled' else 0
+    client.start('a program', 20.0, ends.append)
+    for _ in range(4):
+        client.poll()
+    if how == 'cancelled':
+        # not before the start was answered: it would begin with the other program
+        assert client.is_starting and client.stop()
+        assert programs(setter) == ['a program']
+        (asked,) = starter.waited_for
+        asked.set_result(starter.answer)
+    assert programs(setter) == ['a program', 'mine']
+    assert ends == (['the excitation does not start: somebody drives'] if how == 'refused' else [])
+    assert client.running == (how == 'started')
 
 
 @pytest.mark.parametrize('is_late', [True, False])
