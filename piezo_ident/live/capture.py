@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.block_clock import BlockClock
-from piezo_ident.record.blocks import Samples
+from piezo_ident.record.blocks import RAMPED, Samples
 from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
@@ -84,14 +84,21 @@ class _Topic:
         # counts of samples at which the clock restarted, and samples that are no longer kept
         self._runs: list[int] = []
         self.dropped = self._newest = self.not_finite = 0
+        # samples of ramps of the driver whose t came again, in a command that went on, and since
+        self.ramped = self._ramp = 0
 
     def add(self, samples: Samples, arrival: int) -> None:
         """Take a block; where one with impossible times lies, the record will say."""
         t, restarts = samples.t, self.clock.restarts
-        if t.size and np.isfinite(t).all():
+        if samples.segment == RAMPED:
+            self._ramp += t.size
+        elif t.size and np.isfinite(t).all():
             self.clock.judge(t)
             if self.clock.restarts > restarts:
                 self._runs.append(self.total)
+            else:
+                self.ramped += self._ramp
+            self._ramp = 0
         self.not_finite += samples.not_finite
         self.stream.append(samples, arrival)
         self._newest = t.size
@@ -289,6 +296,8 @@ class Capture:
                 problems.append(f'{topic.clock.late} samples of {key} came twice or out of turn')
             if topic.not_finite:
                 problems.append(f'{topic.not_finite} samples of {key} are NaN or infinite')
+            if topic.ramped:
+                problems.append(f'{topic.ramped} samples of {key} are a ramp to rest in silence')
         for key, (count, reason) in self._unreadable.items():
             problems.append(f'{count} messages on {key} are no blocks ({reason})')
         return tuple(problems)

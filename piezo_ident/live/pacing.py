@@ -94,6 +94,26 @@ class Pace:
         return due
 
 
+class Looks:
+    """
+    Regular looks of a process at what it waits for.
+
+    A process that gets no time from the machine hears nothing meanwhile, and what was sent still
+    waits for it.  A wait is therefore over only where an earlier look fell into its second half.
+    """
+
+    def __init__(self) -> None:
+        self._before = self._now = time.monotonic()
+
+    def look(self) -> None:
+        """Look now."""
+        self._before, self._now = self._now, time.monotonic()
+
+    def is_over(self, since: float, limit: float) -> bool:
+        """Return whether nothing came for longer than a limit [s], on time.monotonic."""
+        return self._now - since > limit and self._before - since > 0.5 * limit
+
+
 class ArrivalClock:
     """
     Times of arrival that go on evenly when somebody sets the clock of the machine.

@@ -237,7 +237,7 @@ class ExcitationNode(LabNode):
     ) -> None:
         """Say what came of it; whoever hears that may start again."""
         playing.is_over = True
-        self.report_status(state, progress, message, level)
+        self.report_status(state, progress, message, level, samples=playing.tick)
 
     def _await_graph(self, playing: Playing) -> None:
         needed, limit = self.values['subscribers'], self.values['wait_limit']

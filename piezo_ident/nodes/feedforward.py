@@ -42,7 +42,7 @@ from piezo_ident.control.inverse import FAR
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.monitor import TrackingError
-from piezo_ident.live.pacing import Rate
+from piezo_ident.live.pacing import Looks, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import Drive, held, Successor, Tracker
 from piezo_ident.model.stage_model import StageModel
@@ -80,6 +80,7 @@ class FeedforwardNode(DrivingNode):
         self._length, self._last_value = 0, 0.0
         self._learner: Learner | None = None
         self._learned: LiveLearning | None = None
+        self._looks = Looks()
         self._last = self._answered = time.monotonic()
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._clear()
@@ -303,13 +304,14 @@ class FeedforwardNode(DrivingNode):
 
     def work(self) -> str:
         """Watch for the end of a reference, or repeat it."""
+        self._looks.look()
         tracker, learner = self._tracker, self._learner
         if self._state == 'waiting' or tracker is None:
             return 'learning' if learner else 'ready'
         if self._state == 'learning' and learner is not None:
             self._repeat(tracker, learner)
         elif self._state == 'tracking':
-            if time.monotonic() - self._last > self.values['silence']:
+            if self._looks.is_over(self._last, self.values['silence']):
                 self._play(tracker.finish())
                 self._halt('done', 'the reference has ended')
         return ''

@@ -24,8 +24,8 @@ from typing import Any
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
-from piezo_ident.nodes.subscriptions import DEPTH, message_class, qos_of, topics_problem
-from piezo_ident.nodes.wire import LATCHED
+from piezo_ident.nodes.subscriptions import message_class, qos_of, topics_problem
+from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
 from piezo_ident.record.bags.recover import Bag
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -341,5 +341,5 @@ def _profile(connection: Connection) -> QoSProfile:
     latched = bool(offered) and all(o.durability == QosDurability.TRANSIENT_LOCAL for o in offered)
     known = [o.depth for o in offered if o.history == QosHistory.KEEP_LAST and o.depth > 0]
     # a replay may be faster than the recording was, so it keeps as many as its readers do
-    least = LATCHED.depth if latched else DEPTH
+    least = LATCHED.depth if latched else STREAM.depth
     return qos_of(reliable=reliable, latched=latched, depth=max([least, *known]))

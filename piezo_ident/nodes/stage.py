@@ -59,13 +59,13 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.companions import Companion
 from piezo_ident.live.guard import Applied, Guard, GuardSettings, LAST_RAMP
-from piezo_ident.live.pacing import Pace, Rate
+from piezo_ident.live.pacing import Looks, Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
-from piezo_ident.record.blocks import BLOCK_SIZE, Samples
+from piezo_ident.record.blocks import BLOCK_SIZE, HELD, RAMPED, Samples
 from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 
@@ -109,7 +109,7 @@ class StageNode(LabNode):
         self._faults = RecentFaults()
         self._counts = self._faults.counts
         self._state = 'idle'
-        self._last = time.monotonic()
+        self._looks, self._last = Looks(), time.monotonic()
         self._pace = self._new_pace()
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
         self._displacement, self._applied = (
@@ -209,7 +209,8 @@ class StageNode(LabNode):
                 not companion.has(samples.t) and self._further[tail].get_publisher_count()
                 for tail, companion in self._companions.items()
             )
-            if lacking and time.monotonic() < since + min(PATIENCE, self.values['silence'] / 2):
+            patience = min(PATIENCE, self.values['silence'] / 2)
+            if lacking and not self._looks.is_over(since, patience):
                 return
             self._waiting.popleft()
             self._take(samples, sequence)
@@ -230,7 +231,7 @@ class StageNode(LabNode):
             self._ramp_timer.cancel()
             self._counts['streams'] += 1
         elif kind is Kind.GAP:
-            self._move([guard.hold(verdict.missing) for guard in self._axis_guards], 'hold:gap')
+            self._move([guard.hold(verdict.missing) for guard in self._axis_guards], HELD)
         applied = [
             self._guarded(tail, guard, samples, kind is Kind.START)
             for tail, guard in zip(self._tails, self._axis_guards, strict=True)
@@ -280,14 +281,16 @@ class StageNode(LabNode):
     # silence
 
     def _on_watch(self) -> None:
+        self._looks.look()
         self._take_complete()
-        silent = time.monotonic() - self._last
-        if self._sample_clock.head is not None and silent > self.values['silence']:
+        is_silent = self._looks.is_over(self._last, self.values['silence'])
+        if self._sample_clock.head is not None and is_silent:
             self._sample_clock.pause()
             if self._is_at_rest:
                 self._end_stream()
                 self._state = 'idle'
             else:
+                silent = time.monotonic() - self._last
                 self._faults.note('silence', f'no voltage for {silent:.2f} s: ramping to rest')
                 self._begin_ramp()
         self._report_state()
@@ -298,7 +301,7 @@ class StageNode(LabNode):
             companion.clear()
 
     def _begin_ramp(self) -> None:
-        self._state, self._segment = 'ramping', 'ramp:silence'
+        self._state, self._segment = 'ramping', RAMPED
         self._pace = self._new_pace()
         self._ramp_timer.reset()
 
@@ -307,7 +310,7 @@ class StageNode(LabNode):
 
     def _on_ramp(self) -> None:
         if (due := self._pace.due()) > 0:
-            self._move([guard.idle(due) for guard in self._axis_guards], 'ramp:silence')
+            self._move([guard.idle(due) for guard in self._axis_guards], RAMPED)
         if self._is_at_rest:
             self._ramp_timer.cancel()
             self._end_stream()

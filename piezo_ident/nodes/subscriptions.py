@@ -5,7 +5,7 @@
 Subscriptions that are emptied now and then, instead of message by message.
 
 The executor takes 0.3 ms to hand over one message; a node that only collects blocks gets them for
-a fifth of that.  A subscription keeps five seconds of blocks, so a pause of the node costs none.
+a fifth of that.
 """
 
 from __future__ import annotations
@@ -32,9 +32,6 @@ from rclpy.subscription import Subscription
 from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from std_msgs.msg import Float64MultiArray
-
-#: messages that a subscription keeps until it is emptied: five seconds of blocks
-DEPTH = 1000
 
 
 class _NotSpun(CallbackGroup):
@@ -97,7 +94,9 @@ def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | Non
     return None
 
 
-def qos_of(*, reliable: bool = True, latched: bool = False, depth: int = DEPTH) -> QoSProfile:
+def qos_of(
+    *, reliable: bool = True, latched: bool = False, depth: int = STREAM.depth
+) -> QoSProfile:
     """Return a QoS that keeps the last messages."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
@@ -149,7 +148,7 @@ class BlockSubscriptions:
         """Hand over all that has come."""
         for topic, (key, subscription) in self._subscriptions.items():
             # no more at once than it keeps, or a flood on one topic starves the others
-            for _ in range(DEPTH):
+            for _ in range(STREAM.depth):
                 message = subscription.handle.take_message(Float64MultiArray, False)
                 if message is None:
                     break
@@ -309,7 +308,7 @@ class RawSubscriptions:
                     continue
                 handle, kind = topic.subscription.handle, topic.subscription.msg_type
                 # no more at once than it keeps, or a flood on one topic starves the others
-                for _ in range(DEPTH):
+                for _ in range(STREAM.depth):
                     message = handle.take_message(kind, True)
                     if message is None:
                         break

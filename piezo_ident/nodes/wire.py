@@ -17,10 +17,11 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 #: most samples of a block, and characters of a label
 MOST, LONGEST = 100_000, 200
 
-#: samples: reliable, the last hundred blocks
+#: samples: reliable, the last five seconds of blocks, on both sides: a reader that gets no time
+#: from the machine meanwhile misses none
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
-    depth=100,
+    depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )

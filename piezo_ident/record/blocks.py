@@ -28,6 +28,9 @@ from piezo_ident.record.record import Segment
 
 #: samples in a block by default
 BLOCK_SIZE = 100
+#: labels of what a driver applies by itself: the last voltage in a gap of the command, and a ramp
+#: to rest where no command comes
+HELD, RAMPED = 'hold:gap', 'ramp:silence'
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5
 #: shortest sampling period of a block [s], that of 10 MHz, the highest rate of a node; and how far

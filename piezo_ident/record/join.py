@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.assemble import assemble
+from piezo_ident.record.blocks import HELD, RAMPED
 from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.options import ReadOptions
@@ -89,7 +90,8 @@ def record_of_streams(
     except DataError as error:
         raise DataError(f'{name}: {error}') from None
     met = [*faults, *sparse.values(), *joined.faults]
-    for key in guarded:
+    for key, applied in guarded.items():
+        met += _driven_alone(applied, streams[applied])
         joined = _without_guarded(joined, key, name, met)
     columns = dict(joined.columns)
     return assemble(
@@ -113,6 +115,26 @@ class Joined:
     columns: dict[str, Array]
     segments: tuple[list[str], list[int]]
     faults: tuple[Fault, ...]
+
+
+def _driven_alone(name: str, stream: BlockStream) -> list[Fault]:
+    """Say where a driver moved the stage by itself while commands were on their way."""
+    (labels, starts), t = stream.labels(), stream.times
+    faults = []
+    for label, action in (
+        (HELD, 'the command did not come, the driver held its voltage'),
+        (RAMPED, 'no command came for long, the driver ramped to rest'),
+    ):
+        # a ramp behind the last command changes nothing; t starts over in the next stream
+        rows = [
+            (a, b)
+            for own, a, b in zip(labels[1:-1], starts[1:-1], starts[2:], strict=True)
+            if own == label and t[b] > t[a - 1]
+        ]
+        if rows:
+            where = f'in {name}, {at_times(t[[a for a, _ in rows]])}'
+            faults.append(Fault(label, where, int(sum(b - a for a, b in rows)), action))
+    return faults
 
 
 def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> Joined:

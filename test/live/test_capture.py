@@ -123,6 +123,43 @@ def test_repeated_blocks_are_dropped_and_said(record):
     assert faults(made)['repeated_rows'].count > 0
 
 
+def ramped(record, begin, count):
+    """Insert a ramp of the driver, behind which it follows the rest of the command again."""
+    for k, (key, s) in enumerate(blocks_of(record)):
+        if k == begin:
+            t = s.t[0] + np.arange(count) / RATE
+            yield APPLIED, Samples(t, np.linspace(s.values[0], 0.0, count), 'ramp:silence')
+            # time passes
+            yield from [('displacement', Samples(np.empty(0), np.empty(0)))] * 50
+        yield key, s
+
+
+def test_a_ramp_in_silence_is_told_and_is_no_repetition(record):
+    capture = capture_of(ramped(record, 200, 300))
+    assert capture.problems == ('300 samples of applied_voltage are a ramp to rest in silence',)
+    (fault,) = capture.record().faults
+    assert (fault.name, fault.count) == ('ramp:silence', 300)
+    assert fault.where == 'in applied_voltage, at 0.25 s'
+    # behind the last command, or before another program, it differs from nothing
+    others = [*ramped(record, 200 * 5, 300), *blocks_of(record)]
+    end = [*blocks_of(record), others[200]]
+    for blocks in (end, [*end, *blocks_of(record)]):
+        capture = capture_of(blocks)
+        assert capture.problems == ()
+        assert not {'ramp:silence', 'hold:gap'} & faults(capture.record()).keys()
+
+
+def test_a_voltage_that_was_held_is_told(record):
+    def held():
+        for k, (key, s) in enumerate(blocks_of(record)):
+            if 400 <= k < 412 and key == 'displacement':
+                continue
+            yield key, replace(s, segment='hold:gap') if 400 <= k < 412 and key == APPLIED else s
+
+    found = faults(capture_of(held()).record())
+    assert (found['hold:gap'].count, found['gap'].count) == (300, 1)
+
+
 def test_a_restart_begins_another_piece(record):
     capture = capture_of([*blocks_of(record), *blocks_of(record)])
     made = capture.record()

@@ -4,7 +4,7 @@
 """When blocks are due, and when they arrived."""
 
 import numpy as np
-from piezo_ident.live.pacing import ArrivalClock, Pace, Schedule, SLIP
+from piezo_ident.live.pacing import ArrivalClock, Looks, Pace, Schedule, SLIP
 import pytest
 
 FS = 20_000.0
@@ -40,6 +40,26 @@ def test_a_change_of_speed():
     schedule = Schedule(1.0, 0.0)
     schedule.change_speed(4.0, 1.0, now=1.0)
     assert schedule.due(2.0) == pytest.approx(1.25)
+
+
+def test_a_process_that_was_held_up_takes_its_own_pause_for_no_silence(monkeypatch):
+    now = [10.0]
+    monkeypatch.setattr('time.monotonic', lambda: now[0])
+    looks = Looks()
+
+    def look(at: float, since: float) -> bool:
+        now[0] = at
+        looks.look()
+        return looks.is_over(since, 0.5)
+
+    assert not look(10.1, 10.0)
+    # held up for a second: what was sent meanwhile is heard before the next look
+    assert not look(11.1, 10.0)
+    assert not look(11.15, 11.12)
+    # looks as they should be: over as soon as the limit has passed
+    assert [look(11.15 + 0.05 * k, 11.12) for k in range(8, 11)] == [False, False, True]
+    # slow looks, and nothing comes
+    assert [look(12.0 + 0.6 * k, 11.9) for k in range(3)] == [False, True, True]
 
 
 class Machine:

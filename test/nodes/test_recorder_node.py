@@ -168,7 +168,7 @@ def test_record_stop_and_refusals(tmp_path):
         for t in info['topics_with_message_count']
     }
     for topic, depth, durability in (
-        ('/a/voltage', 100, 'volatile'),
+        ('/a/voltage', 1000, 'volatile'),
         ('/a/model', 1, 'transient_local'),
     ):
         (qos,) = offered[topic]

@@ -17,6 +17,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from piezo_ident.live.pacing import Looks
 from piezo_ident.nodes.wire import LATCHED, SERVICE
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
@@ -85,7 +86,8 @@ class ExcitationClient:
         self._asked = 0.0
         # the program that the excitation had, as long as it has another one
         self._before: Any = None
-        self._state, self._message = '', ''
+        self._looks = Looks()
+        self._state, self._message, self._sent = '', '', 0
         self.progress = 0.0
 
     @property
@@ -159,6 +161,8 @@ class ExcitationClient:
     def _hear(self, message: DiagnosticStatus) -> None:
         values = {pair.key: pair.value for pair in message.values}
         self._state, self._message = values.get('state', ''), values.get('text', message.message)
+        sent = values.get('samples', '')
+        self._sent = int(sent) if sent.isdecimal() else 0
         if self._phase != 'playing':
             return
         self._sign = time.monotonic()
@@ -176,6 +180,7 @@ class ExcitationClient:
 
     def poll(self) -> None:
         """Continue the run, or give it up after too long a silence."""
+        self._looks.look()
         if self._phase:
             getattr(self, f'_{self._phase}')()
 
@@ -184,7 +189,7 @@ class ExcitationClient:
         return min(self._limit, _UNANSWERED) if self._trouble else self._limit
 
     def _silent(self) -> bool:
-        return time.monotonic() - self._sign > self._limit
+        return self._looks.is_over(self._sign, self._limit)
 
     def _finding(self) -> None:
         ready = self._set.service_is_ready() and self._start.service_is_ready()
@@ -281,12 +286,13 @@ class ExcitationClient:
         if started and self._state == 'done':
             self._done = self._done or now
             # a driver that sends its answers in batches is as late with the last
-            late = now - max(self._done, self._stage_sign)
-            if not behind or late > max(_TAIL, 2.0 * self._slowest):
+            last, patience = max(self._done, self._stage_sign), max(_TAIL, 2.0 * self._slowest)
+            is_whole = streams.voltage - self._first.voltage >= self._sent and not behind
+            if is_whole or self._looks.is_over(last, patience):
                 self._end(None)
         elif started and self._state in _RESTING:
             self._end(f'the excitation ended early ({self._state}): {self._message}')
-        elif behind and heard and now - self._stage_sign > self._patience:
+        elif behind and heard and self._looks.is_over(self._stage_sign, self._patience):
             at = streams.displacement_time
             since = 'none at all' if math.isnan(at) else f'since t = {at:.6g} s'
             why = f'it says: {self._trouble}' if self._trouble else 'is it running?'

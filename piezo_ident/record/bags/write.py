@@ -42,10 +42,10 @@ STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 NAMES = 10_000
 
 _FOREVER = QosTime(9223372036, 854775807)
-#: reliable, volatile, keep last 100: the contract of every topic that carries samples
+#: reliable, volatile, keep last 1000: the contract of every topic that carries samples
 SAMPLE_QOS = Qos(
     history=QosHistory.KEEP_LAST,
-    depth=100,
+    depth=1000,
     reliability=QosReliability.RELIABLE,
     durability=QosDurability.VOLATILE,
     deadline=_FOREVER,

@@ -86,7 +86,7 @@ def test_other_readers_see_the_same(tmp_path, start):
     assert info['custom_data'] == {'sample_rate': '1000.0', 'seed': '7'}
     for topic in info['topics_with_message_count']:
         (qos,) = topic['topic_metadata']['offered_qos_profiles']
-        assert (qos['history'], qos['depth']) == ('keep_last', 100)
+        assert (qos['history'], qos['depth']) == ('keep_last', 1000)
         assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
     assert SAMPLE_QOS.depth == 100
 
