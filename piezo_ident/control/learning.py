@@ -188,7 +188,7 @@ class Learning:
                 f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '
                 'finite number each'
             )
-        e = _bridged(self._wanted - y[drive.lead :], self._model_span, least_step(y))
+        e = _bridged(self._wanted - y[drive.lead :], self._model_span, y[drive.lead :])
         if np.abs(e).max() > FAR * self._model_span:
             raise DataError(
                 f'learning: the stage is {1e6 * np.abs(e).max():.4g} um off the wanted motion; is '
@@ -235,7 +235,7 @@ class Learning:
             yield REVERSED
 
 
-def _bridged(e: Array, stroke: float, step: float) -> Array:
+def _bridged(e: Array, stroke: float, y: Array) -> Array:
     """Return an error without wild readings: what is learned of one would be played."""
-    wild = wild_readings(e, stroke, step)
+    wild = wild_readings(e, stroke, least_step(y), y)
     return e if wild.mean() > MAX_WILD else interpolated(e, wild)

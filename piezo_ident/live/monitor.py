@@ -89,6 +89,11 @@ class Matcher:
         """Measured samples that came again or out of turn."""
         return self._measured.clock.late
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether predicted blocks wait for measured ones."""
+        return bool(self._predicted.waiting)
+
     def predicted(self, samples: Samples) -> list[Matched]:
         """Take a predicted block; return the pairs that it completes."""
         pairs = self._match(samples, self._predicted, self._measured)
@@ -236,6 +241,11 @@ class TrackingError:
         return self._errors(self._matcher.measured(samples))
 
     @property
+    def is_waiting(self) -> bool:
+        """Whether the displacement of what was wanted is still to come."""
+        return self._matcher.is_waiting
+
+    @property
     def percent(self) -> float | None:
         """Its rms [% of the span that was wanted]; None before there is one."""
         return percent(self.live.rms, self._high - self._low) if self.live.seconds else None
@@ -269,8 +279,8 @@ class LiveError:
         self._forget_last()
 
     def _forget_last(self) -> None:
-        # samples that came last, and how many of them are judged
-        self._last, self._judged = np.empty(0), 0
+        # error and measured displacement that came last, and how many of them are judged
+        self._last, self._judged = np.empty((2, 0)), 0
 
     def add(
         self, t: Array, residual: Array, stroke: float = np.inf, measured: Array | None = None
@@ -280,9 +290,11 @@ class LiveError:
 
         What was `measured` [m] tells the codes of a coarse sensor.
         """
-        e = residual[np.isfinite(residual)]
+        finite = np.isfinite(residual)
+        e = residual[finite]
         if not e.size:
             return
+        y = e if measured is None else measured[finite]
         kind, _ = self._clock.judge(t)
         if kind is Kind.LATE:
             return
@@ -291,20 +303,22 @@ class LiveError:
         elif kind is Kind.GAP:
             self._forget_last()
         if measured is not None:
-            self._step = min(self._step, least_step(measured))
-        self._parts.append((float(t[0]), float(t[-1]), *self._sorted(e, stroke)))
+            self._step = min(self._step, least_step(y))
+        self._parts.append((float(t[0]), float(t[-1]), *self._sorted(np.stack([e, y]), stroke)))
         while len(self._parts) > 1 and self._parts[-1][1] - self._parts[0][0] > self.window:
             self._parts.popleft()
 
-    def _sorted(self, e: Array, stroke: float) -> tuple[Array, Array]:
+    def _sorted(self, new: Array, stroke: float) -> tuple[Array, Array]:
         """Return the sums of what is kept and of what is wild, of all that has neighbours."""
+        e = new[0]
         wild = np.zeros(e.size, dtype=bool)
         if np.isfinite(stroke):
-            x = np.concatenate([self._last, e])
-            begin, end = self._judged, max(self._judged, x.size - EDGE)
-            e, wild = x[begin:end], wild_readings(x, stroke, self._step)[begin:end]
+            e, y = x = np.concatenate([self._last, new], axis=1)
+            begin, end = self._judged, max(self._judged, e.size - EDGE)
+            wild = wild_readings(e, stroke, self._step, y)[begin:end]
             first = max(0, end - EDGE)
-            self._last, self._judged = x[first:], end - first
+            self._last, self._judged = x[:, first:], end - first
+            e = e[begin:end]
         kept, out = (np.array([x.size, x.sum(), x @ x]) for x in (e[~wild], e[wild]))
         return kept, out
 

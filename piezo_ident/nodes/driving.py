@@ -43,6 +43,8 @@ class DrivingNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         self._state: str = 'idle'
         self._end = ('', '')
+        # what went wrong on the way to the end
+        self._caveats = ''
         super().__init__(**kwargs)
         self._rate_of_clock = self.values['sample_rate']
         self._tracker: Tracker | None = None
@@ -66,6 +68,7 @@ class DrivingNode(LabNode):
         """Ask for the right to drive."""
         tracker.reset()
         self._faults.clear()
+        self._caveats = ''
         self._output.open()
         self._timer.reset()
         self._go('waiting')
@@ -127,10 +130,12 @@ class DrivingNode(LabNode):
         self._timer.cancel()
         if self._tracker is not None:
             self._tracker.reset()
+        self._caveats = self._faults.summary
         self._go(self._end[0])
 
     def _problems(self) -> str:
-        return '; '.join(filter(None, [self._refusal, self._faults.text]))
+        problems = [self._refusal, *self._caveats.split('; '), *self._faults.text.split('; ')]
+        return '; '.join(filter(None, dict.fromkeys(problems)))
 
     def close(self) -> None:
         """Ramp to rest within a second."""

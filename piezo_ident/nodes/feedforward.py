@@ -200,6 +200,10 @@ class FeedforwardNode(DrivingNode):
 
     def _on_reference(self, message: Float64MultiArray, info: Mapping[str, Any]) -> None:
         if self._state not in ('ready', 'tracking'):
+            if self._state != 'stopping':
+                now = NOW.get(self._state, 'it does not drive; call ~/start')
+                self._faults.note('ignored', f'a reference is not followed: {now}')
+                self.report_state()
             return
         begin = time.perf_counter()
         sequence = info.get('publication_sequence_number')
@@ -263,7 +267,9 @@ class FeedforwardNode(DrivingNode):
         self._segment = self._label(drive.t)
         self._send(drive.t, drive.v, self._segment)
         if drive.clipped:
-            self._faults.note('clipped', 'the reference is out of reach', drive.clipped)
+            count = self._counts['clipped'] + drive.clipped
+            about = f'the reference is out of reach for {count} samples'
+            self._faults.note('clipped', about, drive.clipped)
         wanted = Samples(drive.t, drive.wanted, self._segment, 'reference')
         self._tell(self._error.wanted(wanted))
 
@@ -281,7 +287,8 @@ class FeedforwardNode(DrivingNode):
         self._tell(self._error.wanted(wanted))
 
     def _on_displacement(self, message: Float64MultiArray) -> None:
-        if self._state not in ('tracking', 'learning', 'stopping'):
+        # a stage that is late answers the last of it when the node is at rest
+        if self._state not in ('tracking', 'learning', 'stopping') and not self._error.is_waiting:
             return
         try:
             samples = from_message(message, 'displacement')

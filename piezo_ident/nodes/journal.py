@@ -45,16 +45,24 @@ class RecentFaults:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._latest: dict[str, tuple[str, float]] = {}
+        self._all: dict[str, str] = {}
 
     def clear(self) -> None:
         """Begin anew."""
         self.counts.clear()
         self._latest.clear()
+        self._all.clear()
 
     def note(self, fault: str, message: str, count: int = 1) -> None:
         """Take note of a fault that was met so often."""
         self.counts[fault] += count
         self._latest[fault] = (message, time.monotonic() + FAULT_SHOWN)
+        self._all[fault] = message
+
+    @property
+    def summary(self) -> str:
+        """The last message of each fault since the beginning, as the caveats of a result."""
+        return '; '.join(self._all.values())
 
     @property
     def text(self) -> str:

@@ -182,7 +182,10 @@ class RecorderNode(LabNode):
         if not failure:
             parts = f' and {n} before it' if (n := len(writer.parts) - 1) else ''
             about = f'{writer.messages} messages in {writer.path}{parts}'
-            self._report('done', about, progress=100.0)
+            lost = f'{n} messages were lost on their way' if (n := subscriptions.lost) else ''
+            problems = '; '.join(filter(None, [lost, subscriptions.problems]))
+            about, level = (f'{about}; {problems}', WARN) if problems else (about, OK)
+            self._report('done', about, level, 100.0)
 
     def _end(self, recording: Recording, subscriptions: RawSubscriptions, failure: str) -> None:
         recording.failure = failure

@@ -99,21 +99,34 @@ def least_step(y: Array) -> float:
     return float(steps[steps > 0.0].min(initial=np.inf))
 
 
-def wild_readings(error: Array, stroke: float, step: float = np.inf) -> NDArray[np.bool_]:
+def wild_readings(
+    error: Array, stroke: float, step: float = np.inf, measured: Array | None = None
+) -> NDArray[np.bool_]:
     """
     Return which readings are wild, of measured minus predicted displacement [m].
 
-    What the voltage does is in the prediction; `step` is the `least_step` of what was measured.
+    What the voltage does is in the prediction; `step` is the `least_step` of what was `measured`.
+    A jump of the error is a wild reading only where the measured displacement makes it: a goal out
+    of reach jumps as well.
 
-    >>> wild_readings(np.array([0.0] * 9 + [1.0] + [0.0] * 9), stroke=10.0).nonzero()[0]
+    >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
+    >>> wild_readings(error, stroke=10.0).nonzero()[0]
     array([9])
+    >>> bool(wild_readings(error, stroke=10.0, measured=np.zeros(19)).any())
+    False
     """
     wild = np.zeros(error.size, dtype=bool)
     floor = max(LEAST * stroke, CODES * step if np.isfinite(step) else 0.0)
     if error.size > 1 and np.abs(np.diff(error)).max() > floor:
         for a, b in _alone(error, floor):
-            wild[a:b] = True
+            wild[a:b] = measured is None or _height(measured, a, b) > 0.5 * _height(error, a, b)
     return wild
+
+
+def _height(x: Array, a: int, b: int) -> float:
+    """Return how far numbers lie off the line between their neighbours, at most."""
+    line = np.linspace(x[a - 1], x[b], b - a + 2)[1:-1]
+    return float(np.abs(x[a:b] - line).max())
 
 
 def _overlaps(run: tuple[int, int], others: Runs) -> bool:

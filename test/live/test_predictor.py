@@ -397,6 +397,23 @@ def test_codes_of_a_coarse_sensor_are_not_wild(noise):
     assert live.rms == pytest.approx(np.sqrt(np.mean(e**2)), rel=0.01)
 
 
+def test_a_goal_out_of_reach_is_no_wild_reading():
+    rng, n = np.random.default_rng(4), 4000
+    wanted, tracking = np.full(n, 2e-5), TrackingError(1.0)
+    # three times the goal is elsewhere for a moment, and the stage stays; once a reading is wild
+    for k in (500, 1500, 2500):
+        wanted[k : k + 2] = 3.1e-5
+    y = 2e-5 + rng.normal(0.0, 1e-8, n)
+    e = wanted - y
+    y[3000] = 0.0
+    for k in range(0, n, 100):
+        part = slice(k, k + 100)
+        tracking.wanted(Samples(block(k, 100).t, wanted[part]))
+        tracking.measured(Samples(block(k, 100).t, y[part]))
+    assert tracking.live.outliers == 1
+    assert tracking.live.rms == pytest.approx(np.sqrt(np.mean(e**2)), rel=0.01)
+
+
 def test_live_error_starts_afresh_behind_a_gap():
     live = LiveError(1.0)
     for first, level in ((0, 0.0), (200, 1e-6)):

@@ -180,7 +180,9 @@ def test_it_asks_for_what_it_lacks_and_tells_creep_from_rate_dependence(lab, sto
     report = json.loads(lab.texts(f'{truth}/report')[-1])
     assert report['records'] == ['capture 1', 'capture 2']
     assert (report['verdict'], [e['name'] for e in report['effects']]) == ('named', [truth])
-    assert said[-1]['text'] == report['sentence'].rstrip('.')
+    count = len(report['warnings']) + len(report['data_faults'])
+    caveats = f'; {count} warning{"s" * (count > 1)} in the report' if count else ''
+    assert said[-1]['text'] == report['sentence'].rstrip('.') + caveats
     error = report['error']
     assert error['after']['overall'] < 0.3 * error['before']['overall']
 

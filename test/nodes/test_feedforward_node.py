@@ -196,6 +196,17 @@ def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
     )
     for what in told:
         assert any(what in text for text in said), (what, said)
+    # the result keeps them, also when they are no news any more
+    end = lab.status('feedforward')
+    assert end['level'] == '1'
+    for what in ('400 samples are missing', 'in metres?', 'out of reach for'):
+        assert what in end['text'], end['text']
+    # a reference without a start is not dropped without a word
+    since = len(lab.statuses('feedforward'))
+    lab.publish('reference', block(0, bad, 'scan', 'reference'))
+    lab.wait(
+        lambda: any('~/start' in s['text'] for s in lab.statuses('feedforward')[since:]), 'a word'
+    )
     t, v = column(voltage[first:])
     assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
     assert v.min() >= 0.0 and v.max() <= 10.0

@@ -286,9 +286,9 @@ class ExcitationClient:
         if started and self._state == 'done':
             self._done = self._done or now
             # a driver that sends its answers in batches is as late with the last
-            last, patience = max(self._done, self._stage_sign), max(_TAIL, 2.0 * self._slowest)
+            newest, patience = max(self._done, self._stage_sign), max(_TAIL, 2.0 * self._slowest)
             is_whole = streams.voltage - self._first.voltage >= self._sent and not behind
-            if is_whole or self._looks.is_over(last, patience):
+            if is_whole or self._looks.is_over(newest, patience):
                 self._end(None)
         elif started and self._state in _RESTING:
             self._end(f'the excitation ended early ({self._state}): {self._message}')

@@ -91,12 +91,12 @@ class IdentificationOutcome:
     identification: Identification | None = None
     model: str = ''
 
-    def with_warnings(self, text: str) -> str:
-        """Return a text with the number of warnings behind it."""
-        if not self.warnings or not text:
-            return text
-        plural = 's' * (self.warnings > 1)
-        return f'{text.rstrip(".")}; {self.warnings} warning{plural} in the report'
+
+def with_warnings(text: str, count: int) -> str:
+    """Return a text with the number of warnings in the report behind it."""
+    if not count or not text:
+        return text
+    return f'{text.rstrip(".")}; {count} warning{"s" * (count > 1)} in the report'
 
 
 def settings_of(values: dict[str, object]) -> Settings:
@@ -192,6 +192,8 @@ class DiagnosisOutcome:
         one as YAML.
     figures : mapping of str to str
         The numbers in the sentence.
+    warnings : int
+        Number of warnings and faults of the data in the report.
     wanted : Experiment or None
         The experiment that would decide what is open.
     """
@@ -203,6 +205,7 @@ class DiagnosisOutcome:
     report: str = ''
     model: str = ''
     given: str = ''
+    warnings: int = 0
     wanted: Experiment | None = None
 
 
@@ -262,6 +265,7 @@ def diagnose_capture(
         report=json_text(result),
         model=model_to_yaml(result.model),
         given=model_to_yaml(given),
+        warnings=len(result.warnings) + sum(not fault.is_note for fault in result.faults),
         wanted=next_experiment(result, records, asked),
     )
 

@@ -32,6 +32,7 @@ from piezo_ident.nodes.identifier.jobs import (
     save,
     settings_of,
     warm_up,
+    with_warnings,
 )
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
@@ -300,9 +301,11 @@ class IdentifierNode(LabNode):
         self._report.publish(String(data=outcome.report))
         if outcome.model != (self._published or outcome.given):
             self._publish_model(outcome.model)
-        text = '; '.join([outcome.message.rstrip('.'), *notes])
-        level, brief = WARN if notes else OK, outcome.brief
-        self._set_state('done', 100.0, text, level, brief=brief, **outcome.figures)
+        count = outcome.warnings
+        text = with_warnings('; '.join([outcome.message.rstrip('.'), *notes]), count)
+        level, brief = WARN if notes or count else OK, with_warnings(outcome.brief, count)
+        figures = {**outcome.figures, 'warnings': count}
+        self._set_state('done', 100.0, text, level, brief=brief, **figures)
 
     def fail(self, reason: str) -> None:
         """Report why there is no verdict."""
@@ -348,7 +351,9 @@ class IdentifierNode(LabNode):
                 for warning in identified.warnings:
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
-            text, brief = (result.with_warnings(t) for t in (result.message, result.brief))
+            text, brief = (
+                with_warnings(t, result.warnings) for t in (result.message, result.brief)
+            )
             figures = {**result.figures, 'warnings': result.warnings}
             self._set_state('done', 100.0, text, level, brief=brief, **figures)
         elif isinstance(result, DiagnosisOutcome):

@@ -151,3 +151,25 @@ def test_the_last_answers_of_a_late_driver_are_waited_for(monkeypatch, is_late):
     else:
         # what is lost is not waited for
         assert 0.05 * (k - 4) < 4.2
+
+
+def test_a_done_that_overtakes_the_last_voltage_does_not_end_the_run(monkeypatch):
+    clock, nan = [100.0], float('nan')
+    monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
+    heard, ends = [0], []
+
+    def streams():
+        t = heard[0] / 1000.0 or nan
+        return Streams(heard[0], t, t)
+
+    client = ExcitationClient(Node(0), streams, lambda: '')
+    client.start('a program', 20.0, ends.append)
+    for _ in range(5):
+        client.poll()
+    done = [KeyValue(key='state', value='done'), KeyValue(key='samples', value='3000')]
+    for k, n in enumerate((1000, 2000, 2000, 2000, 3000)):
+        heard[0], clock[0] = n, clock[0] + 0.05
+        if k == 2:
+            client._hear(DiagnosticStatus(values=done))
+        client.poll()
+        assert ends == ([None] if n == 3000 else [])

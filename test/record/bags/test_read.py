@@ -88,7 +88,7 @@ def test_other_readers_see_the_same(tmp_path, start):
         (qos,) = topic['topic_metadata']['offered_qos_profiles']
         assert (qos['history'], qos['depth']) == ('keep_last', 1000)
         assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
-    assert SAMPLE_QOS.depth == 100
+    assert SAMPLE_QOS.depth == 1000
 
 
 def test_a_displacement_of_another_clock_is_told_from_gaps(tmp_path):
