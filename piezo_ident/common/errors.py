@@ -10,6 +10,16 @@ from contextlib import contextmanager
 _LONGEST = 4000
 
 
+def printable(text: str) -> str:
+    r"""
+    Return a text in one line without control characters, which could steer a terminal.
+
+    >>> printable('a\tlabel\x1b[2J')
+    'a label?[2J'
+    """
+    return ''.join(c if c.isprintable() else ' ' if c.isspace() else '?' for c in text)
+
+
 class PiezoIdentError(Exception):
     """
     Base of every error that this package raises on purpose.
@@ -25,13 +35,29 @@ class PiezoIdentError(Exception):
     """
 
     def __init__(self, message: str = '', *, options: str = '') -> None:
-        shown = (c if c.isprintable() else ' ' if c.isspace() else '?' for c in message)
-        super().__init__(''.join(shown)[:_LONGEST])
+        super().__init__(printable(message)[:_LONGEST])
         self.options = options if options.isprintable() else ''
 
 
 class DataError(PiezoIdentError):
     """Measured data that cannot be used as they are."""
+
+
+class OrderError(DataError):
+    """
+    Samples whose times are in no order.
+
+    Parameters
+    ----------
+    fact : str
+        What is wrong, and where.
+    cure : str
+        What to do where they come from a table.
+    """
+
+    def __init__(self, fact: str, cure: str) -> None:
+        super().__init__(f'{fact}; {cure}')
+        self.fact = fact
 
 
 class ConfigError(PiezoIdentError):

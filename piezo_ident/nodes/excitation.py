@@ -29,6 +29,7 @@ from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
+import re
 import threading
 import time
 from typing import Any
@@ -47,6 +48,8 @@ from piezo_ident.record.channels import role_of
 
 #: unit of a program, and what it is in SI
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
+#: the unit in the messages of a program
+_VOLTS = re.compile(r'(?<= )V\b')
 #: most blocks that are sent at once after a delay
 CATCH_UP = 50
 #: share of the voltage limits below which it is said what a program drives
@@ -86,6 +89,7 @@ class Playing:
     clock: Schedule | None = None
     work: float = 0.0
     segment: str = ''
+    second: str = ''
     is_over: bool = False
 
     @property
@@ -151,10 +155,17 @@ class ExcitationNode(LabNode):
             try:
                 count = 1 + sum(map(bool, values.get('axes', ())))
                 built = build_axes(read_program(text), count, values['sample_rate'], limits)
+            except ConfigError as error:
+                raise self._in_unit(error) from None
             except (OSError, MemoryError) as error:
                 raise ConfigError(f'program: {error}') from None
             self._built = (key, built)
         return self._built[1]
+
+    def _in_unit(self, error: ConfigError) -> ConfigError:
+        """Return an error of a program, whose unit may be another than the volts of most."""
+        unit = UNITS[self.values['quantity']][0]
+        return ConfigError(_VOLTS.sub(unit, str(error)))
 
     def _guard_settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
         v = values or self.values
@@ -228,9 +239,12 @@ class ExcitationNode(LabNode):
             self._ramp(playing, 'failed', str(error))
         else:
             clock, behind = playing.clock, ''
+            level = WARN if playing.second else OK
             if clock is not None and clock.late:
                 behind = f', {clock.late} blocks late, by up to {1e3 * clock.worst:.0f} ms'
-            self._end(playing, 'done', 100.0, f'{_name(playing.sequence)} played{behind}')
+            about = f'{_name(playing.sequence)} played{behind}'
+            text = '; '.join(filter(None, [about, playing.second]))
+            self._end(playing, 'done', 100.0, text, level)
 
     def _end(
         self, playing: Playing, state: str, progress: float, message: str, level: bytes = OK
@@ -263,10 +277,12 @@ class ExcitationNode(LabNode):
                 output.refuse_foreign_blocks()
             clock.note(start, stop - start, time.monotonic())
             level, warning = (WARN, f'; {self._second}') if self._second else (OK, '')
+            playing.second = self._second or playing.second
             percent = math.floor(100.0 * stop / sequence.n)
             text = f'{_name(sequence)}, segment {label}{warning}'
             brief = f'{percent} %: {text}'
-            self.report_status('running', percent, text, level, brief=brief, segment=label)
+            more = {'brief': brief, 'problems': self._second, 'segment': label}
+            self.report_status('running', percent, text, level, **more)
         # a stop during the last block
         self._sleep(playing, time.monotonic())
 

@@ -355,7 +355,9 @@ class FeedforwardNode(DrivingNode):
             brief = f'{error:.3g} % of stroke, tracking error; {text}'
         learns = self._state == 'learning' and self._learner
         progress = self._learner.progress if learns and self._learner else 0.0
-        self.report_status(self._state, progress, text, level, brief=brief, **values)
+        self.report_status(
+            self._state, progress, text, level, brief=brief, problems=problems, **values
+        )
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost and refused, head-room, and the tracking error."""

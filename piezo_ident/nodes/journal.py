@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from piezo_ident.common.errors import printable
 
 #: for how long a line that differs from an earlier one in its numbers alone is left out [s]
 QUIET = 10.0
@@ -148,7 +149,7 @@ class FromPackage(logging.Handler):
 
 def one_line(text: str, longest: int = LONGEST) -> str:
     """Return a text in one line, cut where it is too long."""
-    line = ' '.join(text.split())
+    line = ' '.join(printable(text).split())
     return line if len(line) <= longest else f'{line[: longest - 4].rstrip()} ...'
 
 

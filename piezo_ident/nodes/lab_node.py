@@ -24,7 +24,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import piezo_ident
-from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.common.errors import PiezoIdentError, printable
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.given import begin, ParameterNode, unknown_to
@@ -96,13 +96,13 @@ class LabNode(ParameterNode):
         level: bytes = OK,
         *,
         brief: str = '',
+        problems: str = '',
         **values: object,
     ) -> None:
         """
         Publish the latched status.
 
-        The prose is the value that comes last.  The message is short enough for
-        ``ros2 topic echo``, and begins with the figure that counts.
+        The prose is the last value.  The message fits ``ros2 topic echo``, its figure first.
 
         Parameters
         ----------
@@ -116,6 +116,8 @@ class LabNode(ParameterNode):
             As in diagnostic_msgs/DiagnosticStatus.
         brief : str, optional
             The same in few words, a number first; the progress and the text by default.
+        problems : str, optional
+            What of the text is wrong and goes to the log; all by default.
         **values
             Further numbers.
         """
@@ -134,7 +136,7 @@ class LabNode(ParameterNode):
             known = '' if text.startswith(state) else f'{state}: '
             self.journal.tell(f'{known}{text}', level)
         elif level != OK:
-            self.journal.warn(text, level)
+            self.journal.warn(problems or text, level)
 
     def _diagnostic(
         self, level: bytes, message: str, values: Mapping[str, object]
@@ -144,7 +146,7 @@ class LabNode(ParameterNode):
             name=self.get_fully_qualified_name(),
             message=message,
             hardware_id=self.get_namespace(),
-            values=[KeyValue(key=k, value=str(v)) for k, v in values.items()],
+            values=[KeyValue(key=k, value=printable(str(v))) for k, v in values.items()],
         )
 
     def _publish_diagnostics(self) -> None:

@@ -16,7 +16,7 @@ from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
-#: how long to wait for the last displacement of a repetition [s]
+#: how long to wait for the next displacement of a repetition that was sent in full [s]
 PATIENCE = 2.0
 
 
@@ -78,6 +78,8 @@ class Learner:
         """Take a block of displacement."""
         if self.learning is not None and self._pace:
             self.learning.measured(samples, self._tick)
+            # a stage that is late, on a busy machine say, is waited for as long as it answers
+            self._resting = time.monotonic()
 
     def step(self, tracker: Tracker) -> None:
         """

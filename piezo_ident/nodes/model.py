@@ -228,7 +228,8 @@ class ModelNode(LabNode):
         if model is not None and self._error.seconds:
             values['residual_percent'] = error = f'{self._live_error(model):.3g}'
             brief = f'{error} % of stroke, live error; {text}'
-        self.report_status(state, 0.0, text, level, brief=brief, **values)
+        wrong = '; '.join(filter(None, problems))
+        self.report_status(state, 0.0, text, level, brief=brief, problems=wrong, **values)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return how the prediction goes."""

@@ -326,7 +326,7 @@ class StageNode(LabNode):
         now = {'running': segment, 'ramping': 'to rest', 'idle': 'at rest'}[self._state]
         text = f'{faults}; {now}' if faults else now
         level = WARN if faults else OK
-        self.report_status(self._state, 0.0, text, level, segment=self._segment)
+        self.report_status(self._state, 0.0, text, level, problems=faults, segment=self._segment)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, what was lost, altered and refused, and head-room."""

@@ -19,7 +19,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Integers, Mask
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, OrderError
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.blocks import HELD, RAMPED
 from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
@@ -94,17 +94,22 @@ def record_of_streams(
         met += _driven_alone(applied, streams[applied])
         joined = _without_guarded(joined, key, name, met)
     columns = dict(joined.columns)
-    return assemble(
-        joined.t,
-        columns.pop('voltage'),
-        columns.pop('displacement'),
-        joined.segments,
-        {channel_of_quantity(key): x for key, x in columns.items()},
-        name=name,
-        options=options,
-        sample_rate=sample_rate,
-        faults=met,
-    )
+    try:
+        return assemble(
+            joined.t,
+            columns.pop('voltage'),
+            columns.pop('displacement'),
+            joined.segments,
+            {channel_of_quantity(key): x for key, x in columns.items()},
+            name=name,
+            options=options,
+            sample_rate=sample_rate,
+            faults=met,
+        )
+    except OrderError as error:
+        raise DataError(
+            f'{error.fact}; do two nodes publish voltage? end one of them, and record again'
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)

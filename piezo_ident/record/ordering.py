@@ -17,7 +17,7 @@ import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import OrderError
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
 
@@ -120,14 +120,15 @@ def _stretches(
                 begin = size
             elif same_time.any():
                 at = t[start:overlap][same_time][0]
-                raise DataError(
-                    f'{name}: two different samples at t = {at:.9g} s; write t with more '
-                    f'decimals, keep one of them, or give the exact rate: {_mean_rate(t)}'
+                raise OrderError(
+                    f'{name}: two different samples at t = {at:.9g} s',
+                    'write t with more decimals, keep one of them, or give the exact rate: '
+                    f'{_mean_rate(t)}',
                 )
             else:
-                raise DataError(
-                    f'{name}: time is unsorted, {t[start]:.9g} s follows {t[first - 1]:.9g} s; '
-                    'sort the rows by t'
+                raise OrderError(
+                    f'{name}: time is unsorted, {t[start]:.9g} s follows {t[first - 1]:.9g} s',
+                    'sort the rows by t',
                 )
         if rows is None and start > first:
             rows, known = np.arange(t.size), t.copy()

@@ -160,6 +160,15 @@ def test_a_voltage_that_was_held_is_told(record):
     assert (found['hold:gap'].count, found['gap'].count) == (300, 1)
 
 
+def test_two_publishers_are_no_rows_to_be_sorted(record):
+    # two streams of one clock, one of them half a block ahead
+    blocks = list(blocks_of(record))
+    mixed = [blocks[i ^ 4] if i < 40 else blocks[i] for i in range(len(blocks))]
+    with pytest.raises(DataError, match=r'time is unsorted.*two nodes') as caught:
+        capture_of(mixed).record()
+    assert 'sort the rows' not in str(caught.value)
+
+
 def test_a_restart_begins_another_piece(record):
     capture = capture_of([*blocks_of(record), *blocks_of(record)])
     made = capture.record()

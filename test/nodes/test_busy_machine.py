@@ -15,6 +15,7 @@ from graph import crowd, Graph
 import numpy as np
 from piezo_ident.model.simulated_stage import SimulatedStage
 import pytest
+from rcl_interfaces.msg import Log
 
 PROGRAM = """
 limits: [0, 10]
@@ -78,9 +79,14 @@ def test_a_node_that_gets_no_time_misses_nothing(lab):
 
 def test_a_voltage_that_does_not_come_is_told(lab):
     applied, since = lab.collect('applied_voltage'), len(lab.statuses('stage'))
+    lines = lab.lines()
     got = play(lab, 'excitation', lambda _: applied and applied[-1].segment == 'ramp:silence')
     assert got['displacement'][0].size == got['voltage'][0].size < got['applied_voltage'][0].size
     assert any('no voltage' in s['text'] for s in lab.statuses('stage')[since:])
+    # a segment alone is nothing to be warned of
+    assert not [
+        text for _, level, text in lines if level > Log.INFO and text.startswith('segment')
+    ]
     told = 'samples of applied_voltage are a ramp to rest in silence'
     lab.wait(lambda: told in lab.status('identifier')['text'], told)
     assert lab.status('identifier')['level'] == '1'

@@ -73,7 +73,7 @@ FAULTS = {
             'model': '500 samples of voltage are missing',
             'identifier': '500 samples of voltage are missing',
         },
-        warnings=frozenset({'gap'}),
+        warnings=frozenset({'gap', 'hold:gap'}),
     ),
     'three blocks are dropped': Fault(
         [*BLOCKS[:K], *BLOCKS[K + 3 :]],

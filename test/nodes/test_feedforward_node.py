@@ -248,6 +248,10 @@ def test_programs_in_micrometres_are_a_reference(lab):
     # one reference at a time, too
     lab.unpublish('reference')
     lab.start('excitation', {'quantity': 'reference', 'program': program, **limits})
+    taken, why = lab.set(
+        'excitation', 'program', program.replace('amplitude: 25', 'amplitude: 36')
+    )
+    assert not taken and '-1 .. 71 um' in why and ' V' not in why
     since = len(lab.collect('tracking_error'))
     armed(lab)
     assert lab.call('excitation/start')[0]

@@ -5,8 +5,9 @@
 
 import time
 
-from course import PROGRAM, SETTINGS
+from course import block, PROGRAM, SETTINGS
 from graph import best_of_three, Graph, in_time
+import numpy as np
 import pytest
 
 
@@ -41,10 +42,19 @@ def test_run_without_an_excitation_fails_with_the_reason(course):
 
 def test_run_without_a_stage_fails_with_the_reason(driven):
     course = driven
+    # what was captured before is no news of the run
+    for tick in (0, 400):
+        course.publish('voltage', block(tick, np.zeros(200)))
+    course.wait(lambda: course.diagnostics('identifier').get('lost') == '200', 'a gap')
+    course.unpublish('voltage')
+    since = len(course.statuses('identifier'))
     said = 'no publisher of displacement within 1 s'
     # it may take a moment to know of the excitation
     course.wait(lambda: said in course.finish('identifier/run')['text'], said)
     assert course.status('identifier')['level'] == '2'
+    told = {s['text'] for s in course.statuses('identifier')[since:] if s['state'] == 'exciting'}
+    assert any('waiting for a publisher of displacement' in text for text in told)
+    assert not any('missing' in text for text in told)
 
 
 def test_run_drives_the_excitation_and_identifies(measured):

@@ -33,6 +33,12 @@ def test_levels_and_long_texts():
     assert len(lines[-1][1]) == LONGEST
 
 
+def test_control_characters_of_a_label_do_not_reach_a_terminal():
+    lines = Lines()
+    Journal(lines).tell('segment a\x1b[2Jb\x07')
+    assert lines == [('info', 'segment a?[2Jb?')]
+
+
 def test_a_long_path_leaves_room_for_what_is_wrong_with_it():
     path = f'/home/{"a_long_name/" * 20}monday'
     text = shortened(f'{path}: cannot be written; choose another', 100)

@@ -101,6 +101,20 @@ class ExcitationClient:
         return self._phase == 'starting'
 
     @property
+    def waits_for(self) -> str:
+        """What a run waits for before the first block, for people; empty when there is none."""
+        if self._phase == 'finding':
+            missing = self._missing()
+            return (
+                f'waiting for a publisher of {missing}'
+                if missing
+                else 'looking for the excitation'
+            )
+        if self._phase == 'playing' and self._state == 'waiting':
+            return f'the excitation is {self._message}'
+        return 'calling the excitation' if self._phase not in ('', 'playing') else ''
+
+    @property
     def is_possible(self) -> bool:
         """Whether an excitation and a stage are there, as far as is known now."""
         ready = self._set.service_is_ready() and self._start.service_is_ready()

@@ -10,7 +10,7 @@ the worker adds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
@@ -127,7 +127,12 @@ def percent_of(step: str, share: float) -> float:
 
 
 def identify_capture(
-    snapshot: Snapshot, settings: Settings, which: str, steps: Steps | None, tick: Tick
+    snapshot: Snapshot,
+    settings: Settings,
+    which: str,
+    steps: Steps | None,
+    before: StageModel | None,
+    tick: Tick,
 ) -> IdentificationOutcome:
     """
     Make a record of a capture and identify it.
@@ -139,6 +144,8 @@ def identify_capture(
     which : {'all', 'delay', 'dynamics', 'hysteresis'}
     steps : Steps or None
         Results of earlier steps; for single steps only.
+    before : StageModel or None
+        The model of this stage until now.
     tick : callable
     """
     tick('record', 0.0)
@@ -154,6 +161,7 @@ def identify_capture(
         )
     known = (steps or Steps()) if which == 'hysteresis' else None
     result = identify(records, settings, steps=known, progress=tick)
+    result = replace(result, warnings=(*result.warnings, *_reversed(result.model, before)))
     tick('report', 0.98)
     runs = piece_runs(result.model, records, result.memories)
     tick('report', 0.99)
@@ -168,6 +176,16 @@ def identify_capture(
         identification=result,
         model=model_to_yaml(result.model),
     )
+
+
+def _reversed(model: StageModel, before: StageModel | None) -> Iterator[str]:
+    """Yield a warning where the displacement has another sign than it had."""
+    if before is not None and model.scaling.Y * before.scaling.Y < 0.0:
+        y, y0 = 1e6 * model.scaling.Y, 1e6 * before.scaling.Y
+        yield (
+            f'the displacement has changed its sign: Y = {y:.4g} um, {y0:.4g} um in the model '
+            "before; look at the sensor's wires, or at the sign in its driver"
+        )
 
 
 def _sentence(steps: Steps) -> str:

@@ -119,7 +119,10 @@ class IdentifierNode(LabNode):
             # all of a run is captured before it counts as ended
             self._drain()
             self._excitation.poll()
-        if self._excitation.running:
+        if waits_for := self._excitation.waits_for:
+            # what is captured is that of before
+            self._set_state('exciting', 0.0, f'{self._task}: {waits_for}')
+        elif self._excitation.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
             about = f'{self._capture.seconds:.0f} s captured{segment}'
             text, brief = f'{self._task}: {about}', f'{about}: {self._task}'
@@ -132,7 +135,8 @@ class IdentifierNode(LabNode):
     def _report_capture(self, state: str, progress: float, text: str, brief: str = '') -> None:
         problems = self._capture.problems
         text, brief = ('; '.join([t, *problems]) if t else '' for t in (text, brief))
-        self._set_state(state, progress, text, WARN if problems else OK, brief=brief)
+        more = {'brief': brief, 'problems': '; '.join(problems)}
+        self._set_state(state, progress, text, WARN if problems else OK, **more)
 
     def _kept(self) -> str:
         keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
@@ -216,8 +220,9 @@ class IdentifierNode(LabNode):
         self._refuse_when_empty()
         self._using = self._capture.mark()
         settings = settings_of(self.values)
+        before = self._session.given
         job = functools.partial(
-            identify_capture, self._capture.snapshot(), settings, which, self._steps
+            identify_capture, self._capture.snapshot(), settings, which, self._steps, before
         )
         self._task = 'identification' if which == 'all' else f'identification of the {which}'
         self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
