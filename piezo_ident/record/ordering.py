@@ -17,7 +17,7 @@ import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
-from piezo_ident.common.errors import OrderError
+from piezo_ident.common.errors import DataError, OrderError
 from piezo_ident.record.clock import has_restarted
 from piezo_ident.record.record import Fault
 
