@@ -58,11 +58,19 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Link:
+    """Another file, by its address relative to the page, and what it holds."""
+
+    href: str
+    text: str
+
+
+@dataclass(frozen=True)
 class Section:
-    """Tables, pictures and paragraphs below a heading; None is left out."""
+    """What stands below a heading; None is left out."""
 
     title: str
-    parts: Sequence[Table | Shown | str | None]
+    parts: Sequence[Table | Shown | Step | Link | str | None]
 
 
 @dataclass(frozen=True)
