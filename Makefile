@@ -10,6 +10,11 @@ PYTEST_ARGS ?=
 # any of these changed: install again
 DECLARED := setup.py setup.cfg pyproject.toml
 
+# rclpy comes from the wheels, or from a ROS installation that is sourced, and never from both: the
+# environment is made anew where that has changed
+SOURCED := $(or $(ROS_DISTRO),$(AMENT_PREFIX_PATH))
+MADE := .venv/.made$(if $(SOURCED),-sourced)
+
 .PHONY: attack docs netns soak
 .PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash limits mirror study table-one clean distclean
@@ -119,9 +124,9 @@ colcon: .venv/.colcon
 	bash -c '. install/setup.bash && .venv/bin/python .ci/installed_nodes.py install/piezo_ident'
 
 # one environment, more of it as it is asked for
-.venv/.demo: EXTRAS := [ros]
-.venv/.test: EXTRAS := [ros,test,fmu]
-.venv/.colcon: EXTRAS := [colcon,ros]
+.venv/.demo: EXTRAS := $(if $(SOURCED),,[ros])
+.venv/.test: EXTRAS := $(if $(SOURCED),[test],[ros,test,fmu])
+.venv/.colcon: EXTRAS := $(if $(SOURCED),[colcon],[colcon,ros])
 .venv-jazzy/.test: EXTRAS := [test]
 .venv-bench/.bench: EXTRAS := [bench]
 .venv-docs/.docs: EXTRAS := [docs]
@@ -133,8 +138,24 @@ colcon: .venv/.colcon
 	$(PYTHON) -m venv --clear $(@D)
 	touch $@
 
-.venv/.demo .venv/.test .venv/.colcon: .venv/.made $(DECLARED)
-	.venv/bin/pip install --quiet --disable-pip-version-check -e ".$(EXTRAS)"
+# what ROS stands on is among the packages of the system, and built for NumPy 1
+.venv/.made-sourced:
+	@echo 'ROS is sourced ($(SOURCED)): rclpy is taken from there, by PYTHONPATH and'
+	@echo '--system-site-packages; the ROS wheels are not installed'
+	$(PYTHON) -m venv --clear --system-site-packages $(@D)
+	touch $@
+
+INSTALL = .venv/bin/pip install --quiet --disable-pip-version-check $(if $(SOURCED),'numpy<2')
+
+# the demo goes on without nodes; the stamp keeps it from asking for the wheels each time
+.venv/.demo: $(MADE) $(DECLARED)
+	$(INSTALL) -e ".$(EXTRAS)" || { $(INSTALL) -e . && \
+	echo 'no ROS wheels for this machine, see above: installed without them, so the nodes cannot' && \
+	echo 'run; to ask for the wheels again: rm .venv/.demo'; }
+	touch $@
+
+.venv/.test .venv/.colcon: $(MADE) $(DECLARED)
+	$(INSTALL) -e ".$(EXTRAS)"
 	touch $@
 
 .venv-jazzy/.test: .venv-jazzy/.made $(DECLARED)

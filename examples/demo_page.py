@@ -142,7 +142,8 @@ def _parts() -> dict[str, tuple[float, float]]:
 def _last_periods(motion: Motion, label: str, frequency: float, periods: int = 1) -> slice:
     end = _parts()[label][1]
     first, last = np.searchsorted(motion.t, (end - periods / frequency, end))
-    return slice(int(first), int(last))
+    # one more, which closes a loop
+    return slice(int(first), int(last) + 1)
 
 
 def loops_figure(before: Motion, after: Motion) -> Figure:
@@ -328,7 +329,7 @@ def _look_again(recorded: Recorded) -> list[Step]:
             f'{nodes}/player {there} -p bag:={bag} -p rate:={recorded.rate} -p autostart:=true',
         ),
         Step(
-            'the same offline',
+            'offline: predict estimates the creep that earlier motions have left, so it errs less',
             f'{nodes}/piezo_ident predict {model} {bag} --out predicted.csv',
         ),
     ]
@@ -358,7 +359,11 @@ def write_page(out: Path, session: Session, lines: Sequence[str]) -> Path:
     page = Page(
         title='A stage with effects that nobody declared',
         source='The simulated stage creeps, and its hysteresis depends on the rate. '
-        + ('Six node processes ran over DDS at 20 kHz. ' if recorded else session.remark + '. ')
+        + (
+            'The nodes ran as processes over DDS at 20 kHz. '
+            if recorded
+            else session.remark + '. '
+        )
         + 'The model that is identified from voltage and displacement knows neither effect; the '
         'diagnosis finds what it lacks.',
         headline=diagnosis['sentence'],
