@@ -87,6 +87,12 @@ def together(*streams: Array) -> tuple[Array, list[Array]]:
     return t, [rows[np.searchsorted(rows[:, 0], t), 1] for rows in streams]
 
 
+def lacking(samples: Mapping[str, int], n: int) -> str:
+    """Return which topics have less than n samples; empty for none."""
+    few = {topic: n - count for topic, count in samples.items() if count < n}
+    return ', '.join(f'{k} of {n} samples of {topic}' for topic, k in few.items())
+
+
 class Wire:
     """The blocks of some topics as their bytes come; `take` them at least every few seconds."""
 
@@ -116,17 +122,12 @@ class Wire:
 
     def lacks(self, n: int) -> str:
         """Return which topics lack how many of n samples; empty for none."""
-        lacking = {topic: n - samples for topic, samples in self._samples.items()}
-        return ', '.join(f'{k} of {n} samples of {topic}' for topic, k in lacking.items() if k > 0)
+        return lacking(self._samples, n)
 
     def is_over(self, n: int) -> bool:
         """Return whether n samples of each topic have come, or nothing comes any more."""
         self.take()
         return time.monotonic() - self._arrival > QUIET or not self.lacks(n)
-
-    def close(self) -> None:
-        """Hear no more."""
-        self._inputs.close()
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +138,7 @@ class Recording:
     blocks: Blocks
     equal: Mapping[str, bool]
     motion: Motion
+    lost: str
 
 
 class Lab:
@@ -282,26 +284,24 @@ class Lab:
         self.client.forget('recorder')
         self.wait(lambda: self.client.status('recorder'), 'the recorder')
         self.call('recorder/stop', step)
-        recording = self._recording(bag)
-        altered = [
-            f'the bag differs from {t}' for t, equal in recording.equal.items() if not equal
-        ]
+        recording = self._recording(bag, n)
         self.progress.say(f'{step}: residual of the model {recording.motion.text}; in {bag}')
-        return recording, '; '.join(filter(None, [self.wire.lacks(n), *altered]))
+        return recording, recording.lost
 
     def play_to_diagnose(self) -> tuple[Recording, str]:
         """Play the motions, and have the identifier keep these alone."""
         self.ask('identifier/clear')
         return self.play('motions', 'before')
 
-    def _recording(self, bag: Path) -> Recording:
+    def _recording(self, bag: Path, n: int) -> Recording:
         blocks = blocks_in(bag, (*MEASURED, PREDICTION))
         equal = {topic: blocks[topic] == self.wire.blocks[topic] for topic in MEASURED}
         topics = ('/voltage', '/displacement', PREDICTION)
         t, values = together(*(rows_of(blocks[topic]) for topic in topics))
         if not t.size:
             raise pi.DataError(f'{bag}: no samples that all of {", ".join(topics)} have')
-        return Recording(bag, blocks, equal, Motion(t, *values))
+        lost = self.wire.lacks(n) or lacking({k: len(rows_of(x)) for k, x in blocks.items()}, n)
+        return Recording(bag, blocks, equal, Motion(t, *values), lost)
 
     # the replay
 
@@ -332,7 +332,6 @@ class Lab:
             if not lost:
                 break
             self.progress.say(f'replay {rate:g} times as fast: lost {lost}')
-        wire.close()
         recorded = Recorded(
             bag=recording.bag,
             model=model,
@@ -345,11 +344,9 @@ class Lab:
             rate=rate,
             stroke=recording.motion.stroke,
             commands=tuple(self.commands),
+            lost=recording.lost or lost,
         )
-        self.progress.say(
-            'replayed: the free runs live, replayed and offline differ by '
-            f'{recorded.difference:.2g} of stroke'
-        )
+        self.progress.say(f'the free runs live, replayed and offline {recorded.verdict}')
         return recorded
 
     def _differences(self, recording: Recording, replayed: Array, model: Path) -> dict[str, float]:
@@ -396,7 +393,6 @@ def live(out: Path, progress: Steps) -> Session:
         lab.start_replay()
         lab.call('identifier/save', 'reports')
         recorded = lab.replay(after, out / 'reports' / 'diagnosis' / 'model.yaml')
-        lab.wire.close()
         for name, code in nodes.stop().items():
             if code:
                 raise pi.PiezoIdentError(f'node {name} ended with code {code}')

@@ -84,6 +84,8 @@ class Recorded:
         Of the motions [m].
     commands : sequence of str
         What was asked of the nodes, as commands of ROS.
+    lost : str
+        Which samples a busy machine lost, so that nothing can be compared; empty for none.
     """
 
     bag: Path
@@ -93,25 +95,26 @@ class Recorded:
     rate: float
     stroke: float
     commands: Sequence[str]
+    lost: str = ''
 
     @property
-    def difference(self) -> float:
-        """The largest of the differences."""
-        return max(self.differences.values())
+    def verdict(self) -> str:
+        """By how much the free runs differ, or why nobody can say."""
+        if self.lost:
+            return f'cannot be compared: this machine lost {self.lost}'
+        return f'differ by {max(self.differences.values()):.2g} of stroke'
 
     @property
     def problems(self) -> list[str]:
-        """What is not as it should be."""
-        differ = [f'{topic}: the bag differs from the wire' for topic in self._altered]
-        return differ + [
+        """What is not as it should be, though nothing was lost."""
+        if self.lost:
+            return []
+        altered = [topic for topic, (_, _, equal) in self.blocks.items() if not equal]
+        return [f'{topic}: the bag differs from the wire' for topic in altered] + [
             f'the free runs {which} differ by {difference:.2g} of stroke'
             for which, difference in self.differences.items()
             if not difference <= SAME
         ]
-
-    @property
-    def _altered(self) -> list[str]:
-        return [topic for topic, (_, _, equal) in self.blocks.items() if not equal]
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,9 +348,7 @@ def write_page(out: Path, session: Session, lines: Sequence[str]) -> Path:
     ]
     recorded = session.recorded
     if recorded is not None:
-        facts.append(
-            ('free run live, replayed, offline', f'differ by {recorded.difference:.2g} of stroke')
-        )
+        facts.append(('free run live, replayed, offline', recorded.verdict))
     links = {
         'reports/report.html': 'The identification: delay, dynamics, hysteresis, their errors',
         'reports/diagnosis/report.html': 'The diagnosis: residual, candidates, effects added',
