@@ -3,14 +3,19 @@
 
 """The demo without nodes: the page, and what it leads to; and what make installs for it."""
 
+from dataclasses import replace
+import html
+import importlib
 import json
 import os
 from pathlib import Path
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 
+import piezo_ident as pi
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -51,6 +56,71 @@ def test_the_demo_finds_what_is_hidden_and_its_page_leads_to_the_rest(tmp_path):
     assert shown[0] > 0
     assert 'plotjuggler' not in page
     assert 'rclpy' in page
+
+
+@pytest.fixture
+def demo_page(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'examples'))
+    return importlib.import_module('demo_page')
+
+
+@pytest.fixture
+def recorded(demo_page, tmp_path):
+    """Return a recording as it should be."""
+    bag = tmp_path / 'my bags' / 'after'
+    bag.mkdir(parents=True)
+    (bag / 'after.mcap').touch()
+    return demo_page.Recorded(
+        bag=bag,
+        model=tmp_path / 'model.yaml',
+        blocks={'/voltage': (82, 8200, True), '/displacement': (82, 8200, True)},
+        differences={'live and replayed': 0.0, 'live and offline': 2.5e-16},
+        rate=4.0,
+        stroke=1e-5,
+        commands=('ros2 service call /excitation/start std_srvs/srv/Trigger',),
+    )
+
+
+def test_the_page_shows_the_motions_the_residual_the_bag_the_commands_and_plotjuggler(
+    demo_page, recorded, tmp_path
+):
+    motions = pi.Program.load(demo_page.MOTIONS).build()
+    # fewer samples are drawn faster
+    t, v = motions.t[::50], motions.v[::50]
+    motion = demo_page.Motion(t, v, 1e-6 * v, 1.01e-6 * v)
+    diagnosis = {'sentence': 'Creep explains it.'}
+    diagnosis['error'] = {when: {'overall': 0.5} for when in ('before', 'after')}
+    (tmp_path / 'reports/diagnosis').mkdir(parents=True)
+    (tmp_path / 'reports/diagnosis/diagnosis.json').write_text(json.dumps(diagnosis))
+    session = demo_page.Session(motion, motion, recorded)
+    assert session.problems == []
+    file = demo_page.write_page(tmp_path, session, ['0 s'])
+    page = html.unescape(file.read_text(encoding='utf-8'))
+    # in this order
+    wanted = ('id="loops"', 'id="traces"', 'id="residual"', '/my bags/after', '/displacement')
+    wanted += ('2.50e-16', 'sine:120Hz', 'ros2 service call /excitation/start')
+    places = [page.rindex(text) if 'id=' in text else page.index(text) for text in wanted]
+    assert places == sorted(places)
+    assert page.index('2.5e-16 of stroke') < places[0]
+    # a path with a blank can be pasted
+    line = next(line for line in page.splitlines() if 'plotjuggler --layout' in line)
+    _, _, command = line.rpartition('<pre>')
+    words = shlex.split(command.removesuffix('</pre>'))
+    layout, bag = (Path(words[words.index(o) + 1]) for o in ('--layout', '--datafile'))
+    assert layout.is_file()
+    assert bag.name == 'after.mcap'
+    assert bag.is_file()
+
+
+def test_what_differs_is_a_problem_and_what_was_lost_is_not_compared(recorded):
+    altered = {'/voltage': (82, 8200, True), '/displacement': (82, 8200, False)}
+    differ = replace(recorded, blocks=altered, differences={'live and replayed': 1.1e-12})
+    bag, run = differ.problems
+    assert '/displacement' in bag
+    assert '1.1e-12' in run
+    lossy = replace(differ, lost='3 of 8200 samples of /prediction')
+    assert lossy.problems == []
+    assert '3 of 8200 samples of /prediction' in lossy.verdict
 
 
 #: stand for Python, which makes environments, and for pip and Python there; all write what they do
