@@ -149,7 +149,7 @@ INSTALL = .venv/bin/pip install --quiet --disable-pip-version-check $(if $(SOURC
 
 # the demo goes on without nodes; the stamp keeps it from asking for the wheels each time
 .venv/.demo: $(MADE) $(DECLARED)
-	$(INSTALL) -e ".$(EXTRAS)" || { $(INSTALL) -e . && \
+	@$(INSTALL) -e ".$(EXTRAS)" || { $(INSTALL) -e . && \
 	echo 'no ROS wheels for this machine, see above: installed without them, so the nodes cannot' && \
 	echo 'run; to ask for the wheels again: rm .venv/.demo'; }
 	touch $@
