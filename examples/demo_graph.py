@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+import functools
 import json
 import math
 from pathlib import Path
@@ -80,10 +81,7 @@ def blocks_in(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
 
 def together(*streams: Array) -> tuple[Array, list[Array]]:
     """Return the times that all streams of rows (t, value) have, and their values at these."""
-    times = [rows[:, 0] for rows in streams]
-    t = times[0]
-    for other in times[1:]:
-        t = np.intersect1d(t, other)
+    t = functools.reduce(np.intersect1d, (rows[:, 0] for rows in streams))
     return t, [rows[np.searchsorted(rows[:, 0], t), 1] for rows in streams]
 
 
@@ -126,7 +124,6 @@ class Wire:
 
     def is_over(self, n: int) -> bool:
         """Return whether n samples of each topic have come, or nothing comes any more."""
-        self.take()
         return time.monotonic() - self._arrival > QUIET or not self.lacks(n)
 
 
@@ -151,6 +148,8 @@ class Lab:
         self.commands: list[str] = []
         self.reports = client.listen('report')
         self.wire = Wire(client, (*MEASURED, PREDICTION))
+        #: all that is heard, and taken in whatever is waited for
+        self.wires = [self.wire]
 
     def start(self) -> None:
         """Start the nodes; no limit is one that a slow machine meets."""
@@ -197,7 +196,15 @@ class Lab:
         self, condition: Callable[[], Any], what: str, look: Callable[[], None] | None = None
     ) -> None:
         """Wait as long as the nodes live."""
-        self.client.wait(condition, math.inf, what, look or self.nodes.check)
+
+        def each() -> None:
+            self.nodes.check()
+            for wire in self.wires:
+                wire.take()
+            if look is not None:
+                look()
+
+        self.client.wait(condition, math.inf, what, each)
 
     def call(self, service: str, step: str, state: str = 'done') -> None:
         """Call a service, and show the progress of its node until it is in a state."""
@@ -205,8 +212,6 @@ class Lab:
         self.ask(service)
 
         def look() -> None:
-            self.nodes.check()
-            self.wire.take()
             status = self.client.status(node)
             now = status.get('state', '')
             if now in FAILED:
@@ -315,6 +320,7 @@ class Lab:
         """Play a bag to a model node in another namespace, and compare its free run."""
         n = len(rows_of(recording.blocks['/voltage']))
         wire = Wire(self.client, [REPLAYED])
+        self.wires.append(wire)
         for node in ('replay/model', 'replay/player'):
             self.wait(lambda node=node: self.client.status(node), node)
         self.set('replay/model', 'model', str(model))
@@ -374,9 +380,7 @@ class Lab:
 
     def wait_for_model(self, before: int) -> None:
         """Wait until the model node has taken another model."""
-        self.wait(
-            lambda: self.models() > before, 'the model node taking the model', self.nodes.check
-        )
+        self.wait(lambda: self.models() > before, 'the model node taking the model')
 
 
 def live(out: Path, progress: Steps) -> Session:

@@ -102,3 +102,20 @@ def test_a_block_that_differs_and_a_run_that_differs_are_told(demo):
     again = lab._recording(recorded.bag, pi.read(recorded.bag).n)
     assert again.lost == ''
     assert again.equal == {'/voltage': True, '/displacement': False, '/applied_voltage': True}
+
+
+def test_what_is_heard_is_taken_while_anything_is_waited_for(demo):
+    lab, *_ = demo
+
+    class Heard:
+        taken = 0
+
+        def take(self):
+            self.taken += 1
+
+    # of the recording and of its replay: a subscription keeps five seconds of blocks
+    assert len(lab.wires) == 2
+    heard, looks = Heard(), iter(range(3))
+    lab.wires[:] = [heard, heard]
+    lab.wait(lambda: next(looks) == 2, 'the third look')
+    assert heard.taken == 4
