@@ -156,10 +156,7 @@ class Lab:
         self.start_nodes(
             {
                 'stage': {'stage': STAGE, 'silence': 30.0},
-                'identifier': {
-                    'output': str(self.out / 'reports'),
-                    'excitation_limit': PATIENT,
-                },
+                'identifier': {'output': str(self.out / 'reports'), 'excitation_limit': PATIENT},
                 'model': {},
                 'recorder': {},
                 'excitation': {'subscribers': 3, 'wait_limit': PATIENT},
