@@ -16,28 +16,30 @@ SOURCED := $(or $(ROS_DISTRO),$(AMENT_PREFIX_PATH))
 MADE := .venv/.made$(if $(SOURCED),-sourced)
 
 .PHONY: attack docs netns soak
-.PHONY: demo test lint pytest test-graph test-jazzy bench bench-live study-identification colcon
+.PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash limits mirror study table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
 	.venv/bin/python examples/demo.py --out demo_report
 
-test: lint pytest
+# the tests that mostly compute, those of node processes with mypy beside them, then what judges
+# seconds, one after the other; a file stays in one process, the slowest file starts first
+PARALLEL := --dist loadfile --no-loadscope-reorder
+
+test: .venv/.test
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/pytest -n 2 $(PARALLEL) -m 'not timed' --ignore=test/nodes $(PYTEST_ARGS)
+	.venv/bin/mypy & types=$$!; \
+	.venv/bin/pytest -n 3 $(PARALLEL) -m 'not timed' test/nodes $(PYTEST_ARGS); rc=$$?; \
+	wait $$types && exit $$rc
+	.venv/bin/pytest -m timed $(PYTEST_ARGS)
 
 lint: .venv/.test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
-
-# a file of tests stays in one process; node tests mostly wait, and come when the rest is done;
-# what another program's burst made fail is asked once more, alone
-PARALLEL := --dist loadfile
-
-pytest: .venv/.test
-	.venv/bin/pytest -n 2 $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS)
-	.venv/bin/pytest -n 3 $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
-	.venv/bin/pytest --last-failed --last-failed-no-failures none test/nodes $(PYTEST_ARGS)
 
 # node processes over DDS alone
 test-graph: .venv/.test

@@ -101,7 +101,8 @@ setup(
             'nbformat>=5,<6',
             'pytest>=7.4,<10',
             'pytest-timeout>=2.2,<3',
-            'pytest-xdist>=3.5,<4',
+            # 3.7 starts files in the order in which they are collected
+            'pytest-xdist>=3.7,<4',
         ],
         # what the benchmarks set beside the package; all live with one numpy, 2.0 to 2.3
         'bench': [

@@ -4,7 +4,11 @@
 """What all tests share: one thread for the linear algebra, set before NumPy is imported."""
 
 import os
+from pathlib import Path
 import signal
+import time
+
+import pytest
 
 # the matrices are narrow: two threads that share their cores with other work wait for each other
 # (identification of 100,000 samples: 0.8 s with one thread, 7 to 45 s with two on a busy machine)
@@ -13,3 +17,44 @@ for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
 
 # a shell that starts the tests in the background has them ignore Ctrl-C, which is tested here
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+#: files that take longest, the slowest first: they start first, and short ones fill up the end
+SLOWEST = (
+    'diagnosis/test_diagnose.py',
+    'diagnosis/test_two_effects.py',
+    'test_site.py',
+    'examples/test_tutorial.py',
+    'examples/test_demo.py',
+    'identification/test_identify.py',
+)
+#: share of the processors that others may take beside tests that judge seconds
+BUSY = 0.3
+
+
+def pytest_collection_modifyitems(items):
+    order = {Path(__file__).parent / name: i for i, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path, len(order)))
+
+
+@pytest.fixture(scope='session')
+def idle_machine():
+    """Skip tests that judge seconds where other programs keep the processors busy."""
+
+    def times():
+        fields = [int(x) for x in Path('/proc/stat').read_text().split('\n', 1)[0].split()[1:8]]
+        return sum(fields), fields[3] + fields[4]
+
+    if not Path('/proc/stat').exists():
+        return
+    before = times()
+    time.sleep(1.0)
+    total, idle = (b - a for a, b in zip(before, times(), strict=True))
+    busy = 1.0 - idle / max(total, 1)
+    if busy > BUSY:
+        pytest.skip(f'other programs keep {100 * busy:.0f} % of the processors busy')
+
+
+@pytest.fixture(autouse=True)
+def _timed_alone(request):
+    if request.node.get_closest_marker('timed'):
+        request.getfixturevalue('idle_machine')

@@ -14,8 +14,8 @@ Every graph has a ROS domain of its own, so several may run at once; at the end 
 whatever happened.
 
 Tests wait for what they want to see, with a limit that only a failure meets.  Where a time is
-itself what is promised, `in_time` prints it and gives a crowded machine more of it, and
-`best_of_three` measures again what came late.
+itself what is promised, `in_time` judges it, and the test is marked `timed`: such tests run one
+after the other on an idle machine.
 
 What is sent before its reader is known to the sender is lost, so collect before the nodes start,
 or wait with `matched`: both see to it that the nodes know of all readers.
@@ -39,7 +39,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from observer import ENDS, Observer
-from processes import alive, best_of_three, crowd, Handle, in_time, Late, listens, take_domain
+from processes import alive, crowd, Handle, in_time, listens, take_domain
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -51,9 +51,7 @@ __all__ = [
     'ENDS',
     'Graph',
     'Handle',
-    'Late',
     'alive',
-    'best_of_three',
     'crowd',
     'in_time',
     'listens',

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import ctypes
 import fcntl
@@ -24,34 +24,10 @@ LIMIT = 60.0
 DOMAINS = range(1, 100)
 
 
-class Late(AssertionError):
-    """Something took longer than promised."""
-
-
 def in_time(took: float, limit: float, what: str) -> None:
     """See that something took no longer than promised [s], and print how long it took."""
-    crowd = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
-    print(f'{what}: {took:.3f} s of {limit:g} s, {crowd:.1f} programs a processor')
-    if took >= limit * crowd:
-        raise Late(f'{what}: {took:.3f} s, promised are {limit:g} s')
-
-
-def best_of_three(attempt: Callable[[], None]) -> None:
-    """
-    Do something that is timed again when it was `Late`, three times at most.
-
-    Whatever else the machine does holds one try up, and hardly three; a program that is too slow
-    is late each time.
-    """
-    for left in (2, 1, 0):
-        try:
-            attempt()
-        except Late as late:
-            if not left:
-                raise
-            print(f'{late}; once more')
-        else:
-            return
+    print(f'{what}: {took:.3f} s of {limit:g} s')
+    assert took < limit, f'{what}: {took:.3f} s, promised are {limit:g} s'
 
 
 @contextlib.contextmanager

@@ -13,12 +13,13 @@ import signal
 import time
 
 from course import block, column, FS, HIGH, level, pairs_of, paper, SETTINGS, simulated
-from graph import alive, best_of_three, crowd, Graph, in_time, Late, listens
+from graph import alive, crowd, Graph, in_time, listens
 import numpy as np
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.recover import is_unfinished
 from piezo_ident.record.bags.write import write_bag
+import pytest
 
 #: how soon a node has to be gone [s]
 PROMISED = 2.0
@@ -42,19 +43,15 @@ def end(g: Graph, meanwhile: Callable[[], None] = lambda: None) -> None:
     g.wait(look, 'the end of all nodes')
     for handle in g.handles:
         if 'ended before' in handle.complaints:
-            raise Late(f'{handle.name} {handle.complaints}')
+            pytest.fail(f'{handle.name} {handle.complaints}')
         assert handle.process.returncode == 0, (handle.name, handle.log)
         assert not handle.complaints, handle.name
         in_time(took[handle.name], PROMISED, f'the end of {handle.name}')
 
 
+@pytest.mark.timed
 def test_in_the_middle_of_everything(tmp_path):
-    record, tries = simulated(), iter('123')
-
-    def attempt():
-        in_the_middle(record, tmp_path / next(tries))
-
-    best_of_three(attempt)
+    in_the_middle(simulated(), tmp_path)
 
 
 def in_the_middle(record, tmp_path):
@@ -121,7 +118,7 @@ def in_the_middle(record, tmp_path):
                 g.wait(lambda s=stream: s[-1].values[-1] == 0.0, 'rest', 10.0)
         except AssertionError as error:
             # the last blocks of a node that ends may not come through to a crowded observer
-            raise Late('rest was not seen') from error
+            pytest.fail(f'rest was not seen: {error}')
         for stream in (voltage, slow, fed):
             t, v = column(stream)
             assert stream[-1].segment == 'ramp:stop'
@@ -136,13 +133,9 @@ def in_the_middle(record, tmp_path):
     assert kept.n > 0 and not [f for f in kept.faults if f.name == 'truncated_bag']
 
 
+@pytest.mark.timed
 def test_idle_and_before_it_is_up(tmp_path):
-    tries = iter('123')
-
-    def attempt():
-        idle_and_starting(tmp_path / next(tries))
-
-    best_of_three(attempt)
+    idle_and_starting(tmp_path)
 
 
 def idle_and_starting(tmp_path):
