@@ -234,11 +234,13 @@ class ExcitationClient:
         return response
 
     def _asking(self) -> None:
-        response = self._insisted('telling its program')
-        if response is None:
-            return
-        if self._before is None and response.values:
-            self._before = response.values[0]
+        # who remapped the services before this one was asked keeps the program of the run
+        if self._get.service_is_ready() or time.monotonic() - self._sign < _AGAIN:
+            response = self._insisted('telling its program')
+            if response is None:
+                return
+            if self._before is None and response.values:
+                self._before = response.values[0]
         self._phase, self._sign = 'setting', time.monotonic()
         value = Parameter('program', value=self._program).get_parameter_value()
         self._send(self._set, _program(value))
