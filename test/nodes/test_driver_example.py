@@ -3,6 +3,7 @@
 
 """The driver of the documentation in the place of the stage, and what it guarantees."""
 
+import itertools
 from pathlib import Path
 import signal
 import sys
@@ -120,10 +121,12 @@ def test_a_second_publisher_is_refused(lab, begin):
     assert lab.call('excitation/start')[0]
     # for its first second a driver gives way to another
     lab.wait(lambda: len(y) > before + 300, 'a stream')
-    for k in range(5):
-        lab.publish('voltage', block(10_000_000 + 100 * k, 0.5, segment='foreign'))
+    ticks = itertools.count(10_000_000, 100)
+    # the first ones may be sent before the stage knows of this publisher
     lab.wait(
-        lambda: any('second publisher' in s['text'] for s in lab.statuses('stage')), 'refusal'
+        lambda: any('second publisher' in s['text'] for s in lab.statuses('stage')),
+        'refusal',
+        meanwhile=lambda: lab.publish('voltage', block(next(ticks), 0.5, segment='foreign')),
     )
     seen = len(y)
     lab.wait(lambda: len(y) > seen + 40, 'the stream going on')
