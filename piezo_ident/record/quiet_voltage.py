@@ -32,6 +32,9 @@ MOVES, AROUND = 3.0, 9
 BACK = 300
 #: rms of second over first differences, sqrt(3) of white noise, below which it is none
 WHITE = 1.4
+#: share of the power of second differences below a fifth of the sampling rate, 0.027 of white
+#: noise, below which it is none
+LOW = 0.009
 #: path of noise [ranges] that does no harm
 SHORT = 0.01
 
@@ -75,7 +78,12 @@ def _deviation(v: Array) -> float:
     quiet = np.percentile(two, QUIET)
     # sines and small multisines were played
     near = (two <= quiet) & (two > 0.5 * quiet)
-    is_white = near.any() and np.median(two[near] / one[: two.size][near]) > WHITE
+    if not near.any() or np.median(two[near] / one[: two.size][near]) <= WHITE:
+        return 0.0
+    # a dither that was played has power where it was played alone
+    rows = np.diff(v, 2)[: two.size * WINDOW].reshape(-1, WINDOW)[near] * np.hanning(WINDOW)
+    power = np.sum(np.abs(np.fft.rfft(rows)) ** 2, axis=0)
+    is_white = power[: WINDOW // 5].sum() > LOW * power.sum()
     return float(quiet / np.sqrt(6.0)) if is_white else 0.0
 
 

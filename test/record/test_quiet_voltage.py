@@ -110,3 +110,11 @@ def test_windows_that_rest_or_move_and_are_nothing_between_are_no_noise():
         v = np.concatenate([np.full(1150, 1.0), 5 + np.cumsum(np.sin(np.arange(9400) ** 1.5))])
         one = record(v)
         assert with_quiet_voltage(one) is one
+
+
+@pytest.mark.parametrize('band', [(2600,), (4000,), range(2600, 4900, 10)])
+def test_a_dither_that_was_played_is_no_noise(band):
+    phase = np.random.default_rng(0).uniform(0.0, 6.3, len(band))
+    dither = sum(np.sin(2 * np.pi * f * T + p) for f, p in zip(band, phase, strict=True))
+    v = 70.0 - 50.0 * np.cos(2 * np.pi * T) + 0.01 * dither / dither.std()
+    assert with_quiet_voltage(record(v)).faults == ()
