@@ -67,7 +67,7 @@ def rms_above(u: Array, rate: float, edge: float) -> Array:
     return np.asarray(np.sqrt(np.maximum(power, 0.0)))
 
 
-def _windows(u: Array, rate: float) -> Mask:
+def behind_jumps(u: Array, rate: float) -> Mask:
     """Return the samples behind each jump of the voltage."""
     use = np.zeros(u.size, dtype=bool)
     before = min(50, u.size // 10)
@@ -86,7 +86,7 @@ class FastAndCalm:
     @classmethod
     def of(cls, excerpts: Sequence[Excerpt], rate: float, swing: float) -> FastAndCalm:
         """Return them for the fitted parts of runs; `swing` is the range of the voltage."""
-        jumps = [_windows(e.u, rate) & e.use for e in excerpts]
+        jumps = [behind_jumps(e.u, rate) & e.use for e in excerpts]
         rms = [rms_above(e.u, rate, HIGH_PASS) for e in excerpts]
         quiet = np.concatenate(
             [r[e.use & ~j] for e, r, j in zip(excerpts, rms, jumps, strict=True)]

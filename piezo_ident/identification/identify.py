@@ -29,6 +29,7 @@ from piezo_ident.identification.errors import (
     validation_errors,
 )
 from piezo_ident.identification.prepare import Excerpt, prepare, Run
+from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import (
     DynamicsResult,
     FitOutcome,
@@ -54,7 +55,7 @@ from piezo_ident.identification.three_steps import (
     within,
 )
 from piezo_ident.identification.unlabelled import fit_unlabelled
-from piezo_ident.identification.warnings import warnings_of
+from piezo_ident.identification.warnings import warn_of_delay, warn_of_shape, warnings_of
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -134,6 +135,7 @@ def _identify(
 ) -> Identification:
     data = prepare(records)
     runs, scaling = data.runs, data.scaling
+    refuse_delay(data.pieces, settings.delay)
     if data.labelled:
         fit = _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
     elif steps is not None:
@@ -153,7 +155,7 @@ def _identify(
         noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
         noise_source=floor.source,
         stroke=stroke,
-        warnings=(*data.warnings, *fit.warnings),
+        warnings=(*data.warnings, *fit.warnings, *warn_of_shape(predictions, scaling)),
         not_identified=tuple(fit.not_identified),
         settings=settings,
         records=(*records, *validation),
@@ -161,8 +163,7 @@ def _identify(
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
-    names = [record.name for record in records]
-    provenance = _provenance(result, names, fast_error(judged, fit.hysteresis.law, runs))
+    provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, runs))
     return replace(result, model=replace(model, identification=provenance))
 
 
@@ -175,6 +176,7 @@ def _labelled(
     steps: Steps,
 ) -> FitOutcome:
     unstarted, runs = runs, with_starts(runs)
+    steps = steps.beside(settings.delay)
     delay_result = steps.delay or first_step(runs, settings, progress)
     delay = Delay(delay_result.samples)
 
@@ -215,13 +217,19 @@ def _labelled(
         best = next((one for one in reversed(found) if one.left < limit), best)
     runs, fit, held, model = best.runs, best.fit, best.held, best.model
     dynamics, hysteresis = best.dynamics, best.hysteresis
-    warnings = []
-    if best.left > _left(model.without_dynamics(), runs):
-        warnings.append(
-            'G errs more than the hysteresis alone on the data that choose, and was left out; '
-            'record noise of larger amplitude'
+    warnings: list[str] = []
+    missing: dict[str, str] = {}
+    is_given = delay_result.source == 'given'
+    without = replace(model.without_dynamics(), delay=delay if is_given else Delay(0))
+    left = _left(without, runs)
+    if best.left > left:
+        reason = (
+            f'with {"it" if is_given else "both"} the model errs {np.sqrt(best.left / left):.4g} '
+            'times as much on the data that choose as without; record noise of larger amplitude'
         )
-        delay, G = Delay(0), Dynamics.unit()
+        missing = dict.fromkeys(('dynamics',) if is_given else ('delay', 'dynamics'), reason)
+        delay_result = delay_result if is_given else delay_result.unknown
+        delay, G = without.delay, Dynamics.unit()
         dynamics = replace(dynamics, order=(0, 1), covariance=np.zeros((1, 1)))
         hysteresis = third_step(fit, held, G, delay, settings, progress)
         model = model_of(rate, scaling, hysteresis, G, delay)
@@ -230,17 +238,7 @@ def _labelled(
             'the triangle turns too often to hold a part of it out: the number of thresholds '
             f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
         )
-    if delay_result.source == 'scan' and delay_result.agree is None:
-        warnings.append(
-            'no step rises above the noise; the delay was read from the ARX loss alone'
-        )
-    steps_tell = delay_result.step is not None and delay_result.step.samples is not None
-    if delay_result.source == 'free run' and delay_result.scan is None and not steps_tell:
-        warnings.append(
-            'neither steps nor the ARX loss tell the delay; a free run over the noise allows '
-            f'{delay_result.samples} samples, give or take {delay_result.std:.2g}; add larger '
-            'steps, or set --delay'
-        )
+    warnings += warn_of_delay(delay_result)
     lowest = min(float(e.u[e.use].min()) for e in fit)
     highest = max(float(e.u[e.use].max()) for e in fit)
     if lowest > 0.01 or highest < 0.99:
@@ -249,17 +247,16 @@ def _labelled(
             f'{scaling.v(lowest):.3g} .. {scaling.v(highest):.3g} V'
         )
         model = within(model, lowest, highest)
-    masks = []
-    for run in runs:
-        kept = run.held_out()
-        masks.append((run.mask('triangle', 'noise', 'settle', 'step') & ~kept, kept))
+    kinds = ('triangle', 'noise', 'settle', 'step')
+    masks = [(run.mask(*kinds) & ~(out := run.held_out()), out) for run in runs]
     memories = {
         key_of(run): run.start(model.hysteresis.thresholds)
         for run in runs
         if run.memory is not None and sum(key_of(other) == key_of(run) for other in runs) == 1
     }
     return FitOutcome(
-        model, delay_result, dynamics, hysteresis, masks, warnings, memories=memories
+        *(model, delay_result, dynamics, hysteresis, masks, warnings, tuple(missing.items())),
+        memories=memories,
     )
 
 
@@ -341,7 +338,7 @@ def first_steps(
     IdentificationError
         When the data do not carry this step.
     """
-    data, steps = prepare(records), steps or Steps()
+    data, steps = prepare(records), (steps or Steps()).beside(settings.delay)
     with singular_is_ours():
         if which == 'delay':
             if not data.kinds & {'step', 'noise'}:
@@ -354,7 +351,9 @@ def first_steps(
     return replace(steps, delay=delay, dynamics=found)
 
 
-def _provenance(result: Identification, names: list[str], fast: Sequence[float]) -> dict[str, Any]:
+def _provenance(
+    result: Identification, records: Sequence[Record], fast: Sequence[float]
+) -> dict[str, Any]:
     """Return what the model file says about its origin."""
     fit, dynamics = result.hysteresis, result.dynamics
     m, na = fit.hysteresis.thresholds.size, dynamics.order[0]
@@ -365,10 +364,11 @@ def _provenance(result: Identification, names: list[str], fast: Sequence[float])
         'solver': fit.solver,
         'polished': fit.polished,
         'law': fit.law,
+        'delay_source': result.delay.source,
         'errors_of_laws': dict(fit.errors_of_laws),
         'losses': {'model': fit.loss, 'swarm': fit.swarm_loss, 'optimum': fit.optimum_loss},
         'seed': result.settings.seed,
-        'records': names,
+        'records': [record.name for record in records],
         'versions': {
             'python': platform.python_version(),
             'numpy': np.__version__,

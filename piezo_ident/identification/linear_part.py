@@ -72,6 +72,8 @@ class LinearPart:
         Held-out errors of nothing, of a pure delay, and of G, normalised.
     judged : int
         Samples held out.
+    largest : int
+        Largest order that was tried; 0 where the fast motion is too short for any.
     """
 
     delay: Delay
@@ -80,6 +82,7 @@ class LinearPart:
     loss: Array | None
     errors: dict[str, float]
     judged: int = 0
+    largest: int = 0
 
     @property
     def gain(self) -> float:
@@ -314,13 +317,13 @@ def find_linear_part(
             found += [(error, d, fit) for fit, error in fits]
     least = min((error for error, *_ in found), default=np.inf)
     if least > (1.0 - GAIN) * pure_error:
-        return LinearPart(pure, None, scan, loss, errors, judges)
+        return LinearPart(pure, None, scan, loss, errors, judges, size)
     best = min(
         (f for f in found if f[0] <= (1.0 + SLACK) * least),
         key=lambda f: f[2].dynamics.a.size + f[2].dynamics.b.size,
     )
     errors['dynamics'] = best[0]
-    return LinearPart(Delay(best[1]), best[2], scan, loss, errors, judges)
+    return LinearPart(Delay(best[1]), best[2], scan, loss, errors, judges, size)
 
 
 def refined_linear_part(motion: FastMotion, linear: LinearPart) -> LinearPart:

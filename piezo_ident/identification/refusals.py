@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from piezo_ident.common.arrays import Array, true_runs
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.residual.coherence import cross_spectra
 from piezo_ident.residual.stretches import block_means
@@ -21,6 +22,14 @@ CHANCE, MIN_COHERENCE = 1e-7, 256
 MEANS = 1 << 15
 #: means into which a ramp is divided
 RAMP = 64
+#: share by which a model with the voltage must err less on held-out parts than one without it
+BETTER = 0.1
+#: error that is rounding [% of stroke]
+ROUNDING = 1e-9
+#: parts that are predicted in turn, means to which a piece is thinned for that, and plays
+PARTS, ROWS, PLAYS = 8, 500, 8
+#: rates of the decays of a slow drift, in 1 / duration
+DECAYS = 2.0 ** np.arange(-1.0, 7.0, 0.5)
 #: a measured stage under position control stays this close to a straight line, as a share of its
 #: travel (2.4e-4), while its drive bends by 18 times as much or more
 STRAIGHT, BENT = 5e-4, 15.0
@@ -30,27 +39,83 @@ def refuse_undriven(records: Sequence[Record]) -> None:
     """
     Refuse records whose displacement is no answer to the voltage, with an IdentificationError.
 
-    Somewhere the spectra of voltage and displacement have to be coherent, by more than chance
-    (1e-7): for Gaussian noise ``1 - c`` raised to ``L - 1`` is the chance of a coherence c over L
-    segments, whatever the displacement does.  A line is taken out of each segment.  Kept, it
-    counts where the voltage moves by far more than its own noise: two drifts agree by chance.
+    Two proofs of an answer are known.  Somewhere the spectra of voltage and displacement are
+    coherent, by more than chance (1e-7): for Gaussian noise ``1 - c`` raised to ``L - 1`` is the
+    chance of a coherence c over L segments, whatever the displacement does.  A line is taken out
+    of each segment.  Kept, it counts where the voltage moves by far more than its own noise: two
+    drifts agree by chance.  Or, as one loop of a strong hysteresis has little coherence, a model
+    with the voltage predicts parts of the record better than any without.
     """
-    pieces = [piece for record in records for piece in record]
-    if any(piece.n < MIN_COHERENCE and np.ptp(piece.v) > 0.0 for piece in pieces):
+    pieces = [piece for record in records for piece in record if np.ptp(piece.v) > 0.0]
+    if any(piece.n < MIN_COHERENCE for piece in pieces):
         return
     if any(
         _chance(piece, linear=True) < CHANCE
         or (_moves(piece.v) and _chance(piece, linear=False) < CHANCE)
         for piece in pieces
-        if np.ptp(piece.v) > 0.0
     ):
+        return
+    errors = [held_out_errors(piece) for piece in pieces if np.ptp(piece.y) > 0.0]
+    if not errors:
+        return  # what never moves is told by `scaling_of`
+    driven, resting = min(errors, key=lambda pair: pair[0] - (1.0 - BETTER) * pair[1])
+    if driven < (1.0 - BETTER) * resting - ROUNDING:
         return
     low, high = (f([getattr(p.v, f.__name__)() for p in pieces]) for f in (min, max))
     raise IdentificationError(
         f'{", ".join(record.name for record in records)}: the displacement does not answer the '
-        f'voltage, which stays within {low:.4g} .. {high:.4g} V and moves as noise does; record '
-        'the stage while it is driven'
+        f'voltage, which stays within {low:.4g} .. {high:.4g} V: held-out parts are predicted to '
+        f'{driven:.3g} % of stroke with the voltage, and to {resting:.3g} % without it; record '
+        'the stage while it is driven, and see that the sensor measures it'
     )
+
+
+def held_out_errors(piece: Piece) -> tuple[float, float]:
+    """
+    Return what the best model with the voltage, and the best without, leave of held-out parts.
+
+    Both rms, in % of the stroke; each of `PARTS` parts is predicted from all others.  Without the
+    voltage there are a mean, a line, and for slow drift a cubic, a logarithm and a decay in time.
+    With it there are powers of the voltage, and plays whose weight may go with the voltage, on a
+    mean or a line.
+    """
+    m = max(1, piece.n // ROWS)
+    v, y = block_means(piece.v, m), block_means(piece.y, m)
+    u, t = v - v.min(), np.linspace(-1.0, 1.0, v.size)
+    u = u / max(float(u.max()), np.finfo(float).tiny)
+    one = np.ones((t.size, 1))
+    line = np.column_stack([one, t])
+    drifts = [np.log(np.arange(1.0, t.size + 1.0)), *np.exp(-0.5 * np.outer(DECAYS, t + 1.0))]
+    # 3 powers, and plays of widths up to nearly the whole range
+    powers = u[:, None] ** np.arange(1, 4)
+    r = np.arange(1, PLAYS + 1) / (PLAYS + 1.0)
+    plays = play_columns(u, r, u[0] - 0.5 * r).T
+    loops = np.hstack([powers, plays, plays * u[:, None]])
+    resting = [one, line, np.vander(t, 4), *(np.column_stack([one, x]) for x in drifts)]
+    driven = [np.hstack([base, x]) for base in (one, line) for x in (powers, loops)]
+    stroke = float(np.ptp(piece.y))
+    best, rival = (min(_left_of_parts(A, y) for A in columns) for columns in (driven, resting))
+    return 100.0 * best / stroke, 100.0 * rival / stroke
+
+
+def _left_of_parts(A: Array, y: Array) -> float:
+    """Return the rms that least squares on all other parts leave of each part."""
+    left = 0.0
+    for part in np.array_split(np.arange(y.size), PARTS):
+        rest = np.delete(np.arange(y.size), part)
+        x = np.linalg.lstsq(A[rest], y[rest], rcond=1e-9)[0]
+        left += float(np.sum((A[part] @ x - y[part]) ** 2))
+    return float(np.sqrt(left / y.size))
+
+
+def refuse_delay(pieces: Sequence[Piece], delay: int | None) -> None:
+    """Refuse a given delay [samples] that leaves less than half of the longest piece."""
+    longest = max(piece.n for piece in pieces)
+    if delay is not None and 2 * delay > longest:
+        raise IdentificationError(
+            f'delay: {delay} samples are more than half of the longest piece, which has '
+            f'{longest}; give fewer (--delay), or record longer'
+        )
 
 
 def _moves(v: Array) -> bool:

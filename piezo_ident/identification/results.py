@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
@@ -116,7 +116,7 @@ class DelayResult:
     ----------
     samples : int
     std : float
-        [samples]; infinite when the data do not tell.
+        [samples]; infinite when the data do not tell, or were not asked.
     source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
@@ -141,6 +141,11 @@ class DelayResult:
         if self.step is None or self.step.samples is None or self.scan is None:
             return None
         return abs(self.step.samples - self.scan) <= 1
+
+    @property
+    def unknown(self) -> DelayResult:
+        """The same steps and scan where the model is better off without their delay."""
+        return replace(self, samples=0, fraction=0.0, std=float('inf'), source='none')
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +198,13 @@ class Steps:
 
     delay: DelayResult | None = None
     dynamics: tuple[DynamicsResult, Dynamics] | None = None
+
+    def beside(self, delay: int | None) -> Steps:
+        """Return these steps; none of them where they were taken with another given delay."""
+        before = self.delay
+        was_given = before is not None and before.source == 'given'
+        is_same = before is not None and before.samples == delay
+        return Steps() if (was_given or delay is not None) and not is_same else self
 
 
 @dataclass(frozen=True)

@@ -180,6 +180,13 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 
+def no_step(step: StepDelay | None) -> str:
+    """Say why no step tells the delay: there is none, or none that rises above the noise."""
+    if step is None or not step.repeats:
+        return 'there are no steps out of a rest'
+    return 'no step rises above the sensor noise'
+
+
 def delay_from_loss(loss: Array) -> int | None:
     """
     Return the delay that a scan of the ARX loss points to.

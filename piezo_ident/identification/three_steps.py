@@ -36,6 +36,7 @@ from piezo_ident.identification.step1_delay import (
     delay_from_loss,
     delay_from_steps,
     MAX_DELAY,
+    no_step,
     SCAN_ORDER,
 )
 from piezo_ident.identification.step2_dynamics import (
@@ -88,7 +89,7 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     """
     progress('delay', 0.0)
     if settings.delay is not None:
-        return DelayResult(settings.delay, 0.0, 'given')
+        return DelayResult(settings.delay, float('inf'), 'given')
     pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
     step = delay_from_steps(pieces) if pieces else None
     # steps have power at all frequencies; noise up to f leaves a doubt of half a period of f
@@ -107,10 +108,9 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
             found = _upheld(found, runs)
         if found.source != 'none':
             return found
-        what = 'too short to scan' if loss is None else 'that hides it below 30 samples'
+        what = 'too short to scan' if loss is None else f'that hides it below {MAX_DELAY} samples'
         raise IdentificationError(
-            f'delay: no step rises above the sensor noise, and a drive {what}; add larger steps, '
-            'or set --delay'
+            f'delay: {no_step(step)}, and a drive {what}; add larger steps, or set --delay'
         )
     run, start, stop = longest_noise(runs)
     std = 0.5 * run.piece.sample_rate / band_of(run, start, stop)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.delay_check import delay_behind
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.fast_motion import FastAndCalm, FastMotion, moving
 from piezo_ident.identification.hold_out import fitted_parts, held_out_place, MOVES
@@ -47,7 +48,12 @@ from piezo_ident.identification.step3_hysteresis import (
     HysteresisFit,
 )
 from piezo_ident.identification.three_steps import model_of, within
-from piezo_ident.identification.warnings import warn_of_range, warn_of_starts, warn_of_zeros
+from piezo_ident.identification.warnings import (
+    reasons_of,
+    warn_of_range,
+    warn_of_starts,
+    warn_of_zeros,
+)
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -192,7 +198,7 @@ def joint_fit(
         excerpts=tuple(excerpts),
         hysteresis=H,
         gain=0.0 if linear is None else linear.gain,
-        not_identified=tuple(_missing(excerpts, found, linear, settings, band).items()),
+        not_identified=tuple(reasons_of(excerpts, found, linear, settings, rate).items()),
     )
 
 
@@ -205,7 +211,7 @@ def _delay_result(
     band: float,
 ) -> DelayResult:
     if settings.delay is not None:
-        return DelayResult(settings.delay, 0.0, 'given')
+        return DelayResult(settings.delay, float('inf'), 'given')
     loss, scan = (None, None) if linear is None else (linear.loss, linear.scan)
     found = linear is not None and (linear.fit is not None or delay.total > 0.0)
     if step.samples is not None and (not found or abs(delay.total - step.samples) < 1.5):
@@ -215,46 +221,6 @@ def _delay_result(
     # a drive that ends at f leaves a doubt of half a period of f
     std = max(1.0 / np.sqrt(12.0), 0.5 * rate / band)
     return DelayResult(delay.samples, std, 'scan', step, loss, scan, delay.fraction)
-
-
-def _missing(
-    excerpts: Sequence[Excerpt],
-    delay: DelayResult,
-    linear: LinearPart | None,
-    settings: Settings,
-    band: float,
-) -> dict[str, str]:
-    """Return what stayed at its neutral value, and why."""
-    missing = {}
-    if delay.source == 'none':
-        missing['delay'] = (
-            'nothing that the voltage does is fast enough to tell a delay from the lag of the '
-            'hysteresis; add steps or noise'
-        )
-    if linear is None:
-        missing['dynamics'] = (
-            f'the voltage has no jump and little power beyond slow motion (band {band:.3g} Hz), '
-            'so nobody knows how the stage follows faster motion; add steps or noise'
-        )
-    elif linear.fit is None:
-        size = settings.max_order
-        missing['dynamics'] = (
-            f'no order up to ({size}, {size}) errs clearly less on held-out motion than the '
-            'hysteresis and a pure delay; add steps or noise'
-        )
-    if all(_only_jumps(e.u) for e in excerpts):
-        missing['hysteresis'] = (
-            'the voltage only jumps between levels, and what lies between them was never seen; '
-            'add a slow triangle'
-        )
-    return missing
-
-
-def _only_jumps(u: Vector) -> bool:
-    """Return whether a voltage rests, but for a few samples that make nearly all of its way."""
-    du = np.abs(np.diff(u))
-    large = du > 0.02 * float(np.ptp(u))
-    return bool(du[large].sum() > 0.9 * du.sum() and np.mean(large) < 0.1)
 
 
 def fit_unlabelled(
@@ -272,6 +238,18 @@ def fit_unlabelled(
     joint = joint_fit(chosen, parts, settings, progress)
     used, whole = without_harm(chosen, joint.excerpts, joint.G, joint.delay)
     divided = _divided(whole, rate)
+    slow = _slow_delay(joint, *divided)
+    if isinstance(slow, DelayResult):
+        # the memory of the starts goes with the delay
+        with_it = replace(settings, delay=slow.samples)
+        again = joint_fit(chosen, parts, with_it, lambda step, share: progress('dynamics', 1.0))
+        joint = replace(again, delay=slow)
+        used, whole = without_harm(chosen, joint.excerpts, joint.G, joint.delay)
+        divided = _divided(whole, rate)
+    elif slow:
+        missing = dict(joint.not_identified)
+        missing['delay'] = f'{slow}; {missing["delay"]}'
+        joint = replace(joint, not_identified=tuple(missing.items()))
     joint = _simplest(joint, *divided)
     delay = Delay(joint.delay.samples, joint.delay.fraction)
     # what chooses the thresholds is a part of what is fitted, never the held-out end
@@ -364,10 +342,34 @@ def _named(run: Run, fitted: Mask) -> str:
     return f'{run.record} without {start / rate:.4g} to {stop / rate:.4g} s, which are held out'
 
 
+def _slow_delay(
+    joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Excerpt]
+) -> DelayResult | str:
+    """Return the delay that H alone shows, or why it shows none; an empty text if not asked."""
+    if joint.delay.source != 'none' or not _are_all(fitted, choosing):
+        return ''
+    found = delay_behind(fitted, choosing, joint.hysteresis.thresholds)
+    if isinstance(found, str):
+        return found
+    return replace(joint.delay, samples=found.samples, std=found.std, source=found.source)
+
+
+def _are_all(fitted: Sequence[Excerpt], choosing: Sequence[Excerpt]) -> bool:
+    """Return whether there is something to choose by, and something to fit of every run."""
+    return any(e.use.any() for e in choosing) and all(e.use.any() for e in fitted)
+
+
 def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Excerpt]) -> JointFit:
-    """Return the fit, without its G or its delay too where that errs less on what chooses."""
+    """
+    Return the fit, without its G or its delay too where that errs less on what chooses.
+
+    A delay that was given stays.
+    """
+    is_given = joint.delay.source == 'given'
     delay = Delay(joint.delay.samples, joint.delay.fraction)
-    if joint.G.is_static and delay.total == 0.0:
+    neutral = delay if is_given else Delay(0)
+    is_simple = joint.G.is_static and delay.total == neutral.total
+    if is_simple or not _are_all(fitted, choosing):
         return joint
     r = joint.hysteresis.thresholds
 
@@ -375,18 +377,23 @@ def _simplest(joint: JointFit, fitted: Sequence[Excerpt], choosing: Sequence[Exc
         fit = fit_hysteresis(factorise(fitted, r, G, delay), r)
         return fit.left(factorise(choosing, r, G, delay))
 
-    if not any(e.use.any() for e in choosing) or not all(e.use.any() for e in fitted):
-        return joint
-    unit = Dynamics.unit()
+    with_both, without = error(joint.G, delay), error(Dynamics.unit(), neutral)
     # what G is worth counts where it is fast, what it costs where the record goes on
-    if error(joint.G, delay) <= (1.0 + WORSE) * error(unit, Delay(0)) + joint.gain:
+    if with_both <= (1.0 + WORSE) * without + joint.gain:
         return joint
-    reason = 'with dynamics the model errs more on data held out than without; add steps or noise'
-    missing = dict(joint.not_identified) | dict.fromkeys(('delay', 'dynamics'), reason)
+    names = [*([] if is_given else ['delay']), *([] if joint.G.is_static else ['dynamics'])]
+    one, other = (
+        100.0 * np.sqrt(left / sum(int(e.use.sum()) for e in choosing))
+        for left in (with_both, without)
+    )
+    reason = (
+        f'with {" and ".join(names)} the model errs by {one:.4g} % of stroke on data held out, '
+        f'without by {other:.4g} %; add steps or noise'
+    )
     return replace(
         joint,
-        G=unit,
-        delay=replace(joint.delay, samples=0, fraction=0.0, std=float('inf'), source='none'),
+        G=Dynamics.unit(),
+        delay=joint.delay if is_given else joint.delay.unknown,
         dynamics=replace(joint.dynamics, order=(0, 1), methods={}, covariance=np.zeros((1, 1))),
-        not_identified=tuple(missing.items()),
+        not_identified=tuple((dict(joint.not_identified) | dict.fromkeys(names, reason)).items()),
     )

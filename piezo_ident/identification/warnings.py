@@ -8,9 +8,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from piezo_ident.common.arrays import Mask
-from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import DynamicsResult, Identification
+from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.identification.errors import Prediction
+from piezo_ident.identification.fast_motion import behind_jumps, FAST, HIGH_PASS, rms_above
+from piezo_ident.identification.hold_out import MOVES
+from piezo_ident.identification.linear_part import GAIN, LinearPart
+from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    Identification,
+    Settings,
+)
+from piezo_ident.identification.step1_delay import MAX_DELAY, no_step
+from piezo_ident.identification.step3_choice import PAPER_COUNT
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -24,6 +35,13 @@ HARDLY = 0.1
 SLOPE_TOLERANCE = 0.05
 #: zeros of displacement may differ by this share of the stroke before it is said
 ZERO_MOVED = 2e-3
+#: crossings of the range, two a sweep up and down, from which a record is no single sweep
+CROSSINGS = 4.0
+#: parts of the range in which the two branches of a loop are compared, and how many must be seen
+BINS, SEEN = 16, 12
+#: distance of the branches at both ends from which it is said, in parts of that in the middle, and
+#: as a share of the stroke
+OPEN, OPENING = 2.0, 0.1
 #: what each wider law of H has
 LAW_WORDS = {
     'square': 'a square of the voltage',
@@ -54,7 +72,8 @@ def _of_axes(pieces: Sequence[Piece]) -> list[str]:
         name: None
         for piece in pieces
         for name, x in piece.channels.items()
-        if role_of(name) == 'v' and np.ptp(x) > 0.0
+        # the monitor of an axis at rest has noise
+        if role_of(name) == 'v' and np.ptp(x) > MOVES * np.ptp(piece.v)
     }
     if not moved:
         return []
@@ -75,14 +94,33 @@ def _of_law(fit: HysteresisFit) -> list[str]:
     ]
 
 
+def warn_of_delay(delay: DelayResult) -> list[str]:
+    """Return a warning where noise alone tells the delay, and why the steps do not."""
+    if delay.step is not None and delay.step.samples is not None:
+        return []
+    if delay.source == 'scan':
+        return [f'{no_step(delay.step)}; the delay was read from the ARX loss alone']
+    if delay.source == 'free run' and delay.scan is None:
+        return [
+            f'{no_step(delay.step)}, and the ARX loss tells no delay; a free run over the noise '
+            f'allows {delay.samples} samples, give or take {delay.std:.2g}; add larger steps, or '
+            'set --delay'
+        ]
+    return []
+
+
 def _of_fit(result: Identification) -> list[str]:
     delay, dynamics, fit = result.delay, result.dynamics, result.hysteresis
     warnings = []
     if delay.agree is False and delay.step is not None:
-        followed = {'steps': 'the steps were', 'scan': 'the fit was'}
+        followed = {
+            'steps': 'the steps were',
+            'scan': 'the fit was',
+            'free run': 'a free run over the noise was',
+        }.get(delay.source, 'neither was')
         warnings.append(
             f'steps say a delay of {delay.step.samples} samples, the ARX fit says {delay.scan}; '
-            f'{followed.get(delay.source, "a free run over the noise was")} followed'
+            f'{followed} followed'
         )
     measured, modelled = dynamics.slope_measured, dynamics.slope_model
     if np.isfinite(measured) and abs(measured / modelled - 1.0) > SLOPE_TOLERANCE:
@@ -125,11 +163,14 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     warnings = []
     chosen, held = result.error('selection'), result.error('held out')
     error = held if np.isfinite(held) else chosen
-    line = line_error(pieces)
-    if np.isfinite(error) and error > 0.5 * line:
+    line, y = line_error(pieces), np.concatenate([piece.y for piece in pieces])
+    resting = 100.0 * float(y.std() / max(np.ptp(y), np.finfo(float).tiny))
+    # a stage without hysteresis is a line with noise
+    if np.isfinite(error) and error > max(0.5 * line, 2.0 * (result.noise_floor or 0.0)):
         warnings.append(
             f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
-            f'{line:.3g} %: it explains little of these data'
+            f'{line:.3g} % and a constant by {resting:.3g} %: it explains '
+            + ('little of these data' if error > 0.5 * resting else 'little more than the line')
         )
     easy = [row.percent for row in result.errors if row.data == 'held out' and not row.driven]
     if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
@@ -141,11 +182,153 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     fitted = result.error('fitted')
     # a record without noise may be fitted exactly
     if result.dynamics.table is None and held > 3.0 * max(fitted, 1e-9):
+        span = max(float(np.ptp(piece.v)) for piece in pieces)
+        times = sum(float(np.abs(np.diff(piece.v)).sum()) for piece in pieces) / span
+        once = f'the voltage crosses its range {times:.2g} times; drive it more often'
         warnings.append(
             f'the held-out error is {held / max(fitted, 1e-9):.1f} times the fitted one: this '
-            'record does not pin the model down; drive the range more than once'
+            'record does not pin the model down, '
+            + (f'as {once}' if times < CROSSINGS else 'or the stage changes in it')
         )
     return warnings
+
+
+def reasons_of(
+    excerpts: Sequence[Excerpt],
+    delay: DelayResult,
+    linear: LinearPart | None,
+    settings: Settings,
+    rate: float,
+) -> dict[str, str]:
+    """
+    Return which of delay, dynamics and hysteresis unlabelled runs do not tell, and why.
+
+    Parameters
+    ----------
+    excerpts : sequence of Excerpt
+        What was fitted.
+    delay : DelayResult
+    linear : LinearPart or None
+        What fast motion showed; None where there is too little of it.
+    settings : Settings
+    rate : float
+        [Hz]
+    """
+    missing = {}
+    slow = _no_fast_motion(excerpts, rate) if linear is None else ''
+    if delay.source == 'none':
+        missing['delay'] = slow or (
+            f'no delay below {MAX_DELAY} samples lowers the error on held-out fast motion by '
+            f'{GAIN:.0%}; add steps or noise'
+        )
+    if linear is None:
+        missing['dynamics'] = slow
+    elif linear.fit is None and linear.largest == 0:
+        missing['dynamics'] = (
+            'the fast motion is too short to fit any order to; add steps or noise'
+        )
+    elif linear.fit is None:
+        largest = f'no order up to ({linear.largest}, {linear.largest}) errs'
+        given = f'the order {settings.order} that was given does not err'
+        missing['dynamics'] = (
+            f'{given if settings.order else largest} {GAIN:.0%} less on held-out fast motion than '
+            'the hysteresis and a pure delay; add steps or noise'
+        )
+    gap = min(map(_jumped_over, (e.u for e in excerpts)))
+    # on as many levels as the paper has plays, a staircase is a triangle
+    if PAPER_COUNT * gap > 1.0:
+        missing['hysteresis'] = (
+            f'the voltage only jumps between levels, and {gap:.0%} of its range lies between two '
+            'neighbours and was never seen; add a slow triangle'
+        )
+    return missing
+
+
+def _no_fast_motion(excerpts: Sequence[Excerpt], rate: float) -> str:
+    """Say why there is no fast motion to find delay and dynamics in."""
+    power = np.concatenate([rms_above(e.u, rate, HIGH_PASS)[e.use] ** 2 for e in excerpts])
+    rms = float(np.sqrt(power.mean()))
+    if rms > FAST or any((behind_jumps(e.u, rate) & e.use).any() for e in excerpts):
+        return (
+            'the voltage jumps or moves fast, but not for long enough to fit dynamics and to '
+            'judge them; add steps or noise'
+        )
+    if 4.0 * HIGH_PASS > rate:
+        return (
+            f'the voltage has no jump out of a rest, and in a record of {rate:.4g} Hz other '
+            f'motion is too slow: it counts above {HIGH_PASS:g} Hz, sampled at '
+            f'{4.0 * HIGH_PASS:g} Hz or more; add steps, or sample faster'
+        )
+    return (
+        f'the voltage has no jump out of a rest, and moves by {100.0 * rms:.2g} % of its range '
+        f'above {HIGH_PASS:g} Hz (rms), of which {100.0 * FAST:g} % are needed; add steps or noise'
+    )
+
+
+def _jumped_over(u: Array) -> float:
+    """
+    Return the widest gap between levels at which a voltage rests, as a share of its range.
+
+    It is 0 unless the voltage rests, but for a few samples that make nearly all of its way.
+    """
+    du, span = np.abs(np.diff(u)), float(np.ptp(u))
+    large = du > 0.02 * span
+    if span == 0.0 or du[large].sum() <= 0.9 * du.sum() or np.mean(large) >= 0.1:
+        return 0.0
+    return float(np.diff(np.sort(u[1:][~large])).max(initial=0.0)) / span
+
+
+def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[str]:
+    """
+    Return a warning where the displacement does with the voltage what no H of this package can.
+
+    The branches of H rise, and so less than half of the variance of a loop is even, the same for
+    a rise of the voltage from the middle as for a fall.  Loops of plays are widest in the middle.
+    """
+    measured = _branches(predictions, [p.run.piece.y / scaling.Y for p in predictions])
+    modelled = _branches(predictions, [p.y_hat / scaling.Y for p in predictions])
+    seen = np.isfinite(measured[0] + measured[1])
+    thirds = [slice(0, 6), slice(6, 10), slice(10, BINS)]
+    if seen.sum() < SEEN or not all(seen[third].any() for third in thirds):
+        return []
+    warnings, middle = [], scaling.v(0.5)
+    rise, fall = measured[0], measured[1, ::-1]
+    even, odd = (float(np.nanvar(x)) for x in (rise + fall, rise - fall))
+    if even > odd:
+        warnings.append(
+            f'{even / (even + odd):.0%} of the displacement is even in the voltage about '
+            f'{middle:.4g} V, the same for a rise as for a fall (variance of its mean loop): the '
+            'branches of H rise, and hold less than half of that'
+        )
+    apart, of_model = (
+        [float(np.nanmean((x[1] - x[0])[third])) for third in thirds] for x in (measured, modelled)
+    )
+    if all(
+        abs(apart[i]) > max(OPEN * abs(apart[1]), OPENING)
+        and abs(apart[i] - of_model[i]) > 0.5 * abs(apart[i])
+        for i in (0, 2)
+    ):
+        low, mid, high = (1e6 * abs(scaling.Y) * abs(w) for w in apart)
+        warnings.append(
+            f'the loops open towards the ends: rising and falling branch are {low:.3g} um apart '
+            f'below {middle:.4g} V, {high:.3g} um above, and {mid:.3g} um around it; the loops of '
+            'H are widest in the middle'
+        )
+    return warnings
+
+
+def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Array:
+    """Return the means of signals in parts of the range, shape (2, BINS), rising and falling."""
+    u, x = np.concatenate([p.run.u for p in predictions]), np.concatenate(signals)
+    du = np.concatenate([np.gradient(p.run.u) for p in predictions])
+    use = np.concatenate([p.run.use for p in predictions])
+    bins = np.clip((u * BINS).astype(int), 0, BINS - 1)
+    found = np.full((2, BINS), np.nan)
+    for branch, there in zip(found, (use & (du > 0.0), use & (du < 0.0)), strict=True):
+        count = np.bincount(bins[there], minlength=BINS)
+        total = np.bincount(bins[there], x[there], minlength=BINS)
+        np.divide(total, count, out=branch, where=count > 0)
+    return found
 
 
 def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:

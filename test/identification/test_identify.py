@@ -12,6 +12,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program
+from piezo_ident.identification import identify as identify_module
 from piezo_ident.identification import three_steps
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.refusals import refuse_undriven
@@ -582,6 +583,23 @@ def test_small_noise_at_a_bias_drives_the_stage():
     piece = short(noise=1e-4).pieces[0]
     (noise,) = piece.find('noise')
     refuse_undriven([Record((piece.cut(noise.start, noise.stop),), 'noise')])
+
+
+@pytest.mark.parametrize(('delay', 'used', 'missing'), [(5, 5, []), (None, 0, ['delay'])])
+def test_a_g_that_goes_takes_no_given_delay_along(monkeypatch, delay, used, missing):
+    second = identify_module.second_step
+
+    def wrong(*args):
+        # a lag of 0.25 s, as no stage here has
+        return second(*args)[0], Dynamics([-0.9998], [2e-4])
+
+    monkeypatch.setattr(identify_module, 'second_step', wrong)
+    settings = replace(QUICK, delay=delay, order=(2, 2))
+    result = identify(short(), settings)
+    assert result.model.dynamics.is_static
+    assert result.model.delay.total == result.delay.samples == used
+    assert list(dict(result.not_identified)) == [*missing, 'dynamics']
+    assert all('times as much' in why for _, why in result.not_identified)
 
 
 @pytest.mark.parametrize('hold_out', [1e-4, 1e-3])

@@ -11,6 +11,7 @@ from piezo_ident.identification.results import (
     Identification,
     Settings,
     silent,
+    Steps,
 )
 from piezo_ident.identification.step1_delay import StepDelay
 import pytest
@@ -90,3 +91,13 @@ def test_headline_is_about_the_record_for_validation():
     assert (headline.data, headline.records) == ('validation', ('other',))
     assert (headline.percent, headline.static_percent) == (4.0, 5.0)
     assert np.isnan(result_of().headline.percent)
+
+
+def test_steps_beside_another_delay_are_taken_again():
+    found = Steps(DelayResult(3, 0.3, 'steps'))
+    given = Steps(DelayResult(3, float('inf'), 'given'))
+    assert found.beside(None) is found
+    assert found.beside(3) is found
+    assert given.beside(3) is given
+    for steps, delay in ((found, 5), (given, 5), (given, None), (Steps(), 5)):
+        assert steps.beside(delay).delay is None

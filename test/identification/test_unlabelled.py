@@ -16,7 +16,9 @@ from piezo_ident.identification.results import Settings, silent
 from piezo_ident.identification.unlabelled import joint_fit
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.identification import facts
 import pytest
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
@@ -164,3 +166,37 @@ def test_what_chooses_lies_within_what_is_fitted():
     assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
     unseen = STAGE.simulate(v := sine(2.0, 3.0))
     assert np.std(result.model.simulate(v) - unseen) < 2e-3 * np.ptp(unseen)
+
+
+def slow_record(delay, n=800):
+    """Return a sine of 1 Hz and varying size at 200 Hz through plays and a pure delay."""
+    t = np.arange(n) / 200.0
+    v = 1.8 - 1.75 * np.cos(2 * np.pi * t) * (0.55 + 0.45 * np.cos(2 * np.pi * t / 8))
+    H = Hysteresis(np.arange(1, 8) / 8.0, np.full(7, 0.12), 0.1, 1.0)
+    y = Delay(delay).apply(H((v - v.min()) / np.ptp(v)))
+    y = y + 1e-3 * np.random.default_rng(0).standard_normal(n)
+    return Record.from_arrays(v, 1e-5 * y, sample_rate=200, name='slow')
+
+
+@pytest.mark.parametrize('delay', [0, 7])
+def test_a_given_delay_is_used_and_labelled_even_where_another_errs_less(delay):
+    result = identify(slow_record(3), Settings(delay=delay, thresholds=6))
+    assert (result.delay.samples, result.delay.source) == (delay, 'given')
+    assert result.model.delay.total == delay
+    assert 'delay' not in dict(result.not_identified)
+    assert result.model.identification['delay_source'] == 'given'
+    # nobody measured how far off it is
+    assert result.model.identification['uncertainties']['delay'] is None
+    assert dict(facts(result))['delay'].startswith(f'{delay} samples (given)')
+
+
+def test_a_given_delay_of_most_of_the_record_is_refused():
+    with pytest.raises(IdentificationError, match='--delay'):
+        identify(slow_record(3), Settings(delay=500))
+
+
+def test_slow_motion_of_many_sizes_tells_a_long_delay():
+    result = identify(slow_record(3), Settings(thresholds=6))
+    assert (result.delay.samples, result.delay.source) == (3, 'free run')
+    assert result.model.delay.total == 3
+    assert list(dict(result.not_identified)) == ['dynamics']
