@@ -141,6 +141,7 @@ IDENTIFIER = (
     ),
     Declaration('polish', False, 'whether least squares finish what the swarm found'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
+    Declaration('delay', -1, 'delay that is used; -1: identified', 'samples', -1, 10_000),
     Declaration('seed', 0, 'of everything that is drawn by chance', '1', 0, 2**31 - 1),
     Declaration('swarm_size', 40, 'particles', '1', 2, 10_000),
     Declaration('swarm_iterations', 20_000, 'most iterations of the swarm', '1', 1, 10_000_000),

@@ -64,13 +64,16 @@ def facts(result: Identification) -> list[tuple[str, str]]:
     # slow poles are removed after the search for the order
     na, nb = model.dynamics.a.size, model.dynamics.b.size
     low, high = model.scaling.range
+    samples = f'{delay.samples} ± {number(delay.std, 2)} samples'
+    if delay.source == 'given':
+        samples = f'{delay.samples} samples (given)'
     lag = 1e6 * model.delay.total / model.sample_rate
     texts = {
         'stroke': length(result.stroke),
         'voltage': f'{low:g} .. {high:g} V',
         'direction': 'retracts with rising voltage' if model.scaling.Y < 0.0 else '',
         'sampling rate': f'{model.sample_rate:g} Hz',
-        'delay': f'{delay.samples} ± {number(delay.std, 2)} samples = {lag:.4g} µs',
+        'delay': f'{samples} = {lag:.4g} µs',
         'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
         'hysteresis': _law(result),
         'error holds': _stands_for(result),
@@ -156,7 +159,8 @@ def dynamics_tables(result: Identification) -> list[Table]:
     model, dynamics, delay = result.model, result.dynamics, result.delay
     G = model.dynamics
     na, nb = G.a.size, G.b.size
-    rows = [('used', str(delay.samples), number(delay.std, 2), delay.source)]
+    std = '–' if delay.source == 'given' else number(delay.std, 2)
+    rows = [('used', str(delay.samples), std, delay.source)]
     if delay.step is not None:
         samples = '–' if delay.step.samples is None else str(delay.step.samples)
         source = f'average of {delay.step.repeats}' if delay.step.repeats else 'no steps'

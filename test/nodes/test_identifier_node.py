@@ -317,13 +317,18 @@ def test_a_fault_that_spoils_the_data_is_a_failure_with_its_reason(empty, blocks
 
 
 def test_settings_reach_the_work(fed):
-    for name, value in (('solver', 'least_squares'), ('seed', 5), ('max_order', 3)):
+    for name, value in (
+        *(('solver', 'least_squares'), ('seed', 5), ('max_order', 3)),
+        ('delay', 4),
+    ):
         assert fed.set('identifier', name, value) == (True, '')
     made(fed)
     first = fed.texts('model')[-1]
     model = model_of(first)
     assert (model.identification['solver'], model.identification['seed']) == ('least_squares', 5)
     assert model.dynamics.a.size <= 3 and model.hysteresis.weights.size == 9
+    assert (model.delay.samples, model.identification['delay_source']) == (4, 'given')
+    assert fed.set('identifier', 'delay', -1) == (True, '')
     for name, value in (
         ('solver', 'swarm'),
         ('thresholds', 6),

@@ -109,11 +109,13 @@ def settings_of(values: dict[str, object]) -> Settings:
         When a value is out of range.
     """
     swarm = values['solver'] == 'swarm'
+    delay = int(str(values['delay']))
     return Settings(
         thresholds=int(str(values['thresholds'])) or None,
         solver=str(values['solver']),  # type: ignore[arg-type]
         polish=swarm and bool(values.get('polish')),
         max_order=int(str(values['max_order'])),
+        delay=None if delay < 0 else delay,
         swarm_size=int(str(values['swarm_size'])),
         swarm_iterations=int(str(values['swarm_iterations'])),
         seed=int(str(values['seed'])),
