@@ -38,6 +38,19 @@ def true_runs(mask: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def closed(mask: Mask, most: int) -> Mask:
+    """
+    Return a mask that goes on over up to `most` samples between two stretches of true ones.
+
+    >>> closed(np.array([False, True, False, True, False, False, True]), 1).astype(int)
+    array([0, 1, 1, 1, 0, 0, 1])
+    """
+    new = mask.copy()
+    for a, b in true_runs(~mask):
+        new[a:b] = b - a <= most and a > 0 and b < mask.size
+    return new
+
+
 def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
     """
     Return numbers with straight lines between usable good ones in place of the bad ones.

@@ -31,7 +31,8 @@ from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.faults import least_step, MAX_WILD, wild_readings
+from piezo_ident.record.faults import MAX_WILD
+from piezo_ident.record.jumps import least_step, wild_readings
 
 #: share of the error that a run must leave at most for another one
 WORTH = 0.95

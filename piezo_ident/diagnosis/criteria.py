@@ -69,8 +69,6 @@ UNRELATED = 0.99
 AGAINST = -0.9
 #: share to which the rms of the noise is known
 NOISE_KNOWN = 0.1
-#: share of samples with a fault up to which they are left out; beyond it little else is there
-FAULTY = 0.02
 
 # -- taste ---------------------------------------------------------------------------------------
 

@@ -50,13 +50,14 @@ from piezo_ident.diagnosis.verdict import (
     smallest_detectable,
     untestable_of,
 )
-from piezo_ident.identification.prepare import same_rate
+from piezo_ident.identification.prepare import filled_in, same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.faults import suspicions
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Record, records_of
+from piezo_ident.record.suspicions import suspicions
 from piezo_ident.residual import (
     all_stretches,
     channel_tests,
@@ -135,7 +136,8 @@ def diagnose(
         raise IdentificationError('no record was given')
     for record in records:
         record.require_displacement()
-    quiet = [with_quiet_voltage(record) for record in records]
+    measured = [without_faults(record) for record in records]
+    quiet = [with_quiet_voltage(record) for record in measured]
     part = _beginnings(model, quiet, settings.most_samples)
     is_whole = part == quiet
     try:
@@ -151,14 +153,25 @@ def diagnose(
         ) from None
     warnings = [
         warning
-        for record in records
+        for record in measured
         for warning in (*suspicions(record), *model.extrapolation(record))
     ]
     if not is_whole:
         warnings.append(part_searched(records, part))
+    # what reading found is told where a record is read
+    lost = (
+        replace(fault, where=f'in {record.name}, {fault.where}')
+        for record, sound in zip(records, measured, strict=True)
+        for fault in sound.faults[len(record.faults) :]
+    )
     pieces = [piece for record in records for piece in record]
     outside = sum(int(model.outside(p.v).sum()) for p in pieces) / sum(p.n for p in pieces)
-    result = replace(result, warnings=(*result.warnings, *warnings), outside=outside)
+    result = replace(
+        result,
+        faults=(*lost, *result.faults),
+        warnings=(*result.warnings, *warnings),
+        outside=outside,
+    )
     return replace(result, sentence=sentence(result))
 
 
@@ -200,9 +213,12 @@ def _diagnosed(
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     faults = find_faults(_parts(Simulator(model, rows), given))
-    few = faults.left_out(criteria.FAULTY)
-    if any(bad is not None for bad in few):
-        rows = make_rows(model, records, few)
+    if any(bad.any() for bad in faults.bad):
+        rows = make_rows(model, records, faults.bad)
+    if not all(run.use.all() for run in rows.runs):
+        pairs = zip(rows.runs, Simulator(model, rows).full(given), strict=True)
+        runs = tuple(filled_in(run, model.scaling.y(x), model.scaling) for run, x in pairs)
+        rows = replace(rows, runs=runs, x=rows.of([run.x for run in runs]))
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
     # 2. the base model refitted, as plays and as the widest law
@@ -216,7 +232,7 @@ def _diagnosed(
     _check_related(simulator, given, plays)
     # 3. lines and noise of what it leaves
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
-    noise, single = _noise(floor, faults.quantum, rows.m, abs(model.scaling.Y))
+    noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
     # periods in which a memory settles repeat by less than the noise: no model errs less than that
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
@@ -341,21 +357,6 @@ def _beside_the_drive(
     resting = _parts(simulator, state, whole=True)
     quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
     return channels, found, residual_noise_floor(quiet, all_stretches(resting))
-
-
-def _noise(floor: NoiseFloor, quantum: float, m: int, span: float) -> tuple[float, float | None]:
-    """
-    Return the mean squares of the noise in a row of m samples and in one, normalised by a span.
-
-    That of one is None where the floor is unknown.
-    """
-
-    def square(rms: float, m: int) -> float:
-        # a reading that rests on one step of the converter hides its rounding
-        return float(max(rms, quantum / np.sqrt(12.0 * m)) / span) ** 2
-
-    single = None if floor.rms is None else square(floor.rms, 1)
-    return square(floor.at(m) or 0.0, m), single
 
 
 def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:

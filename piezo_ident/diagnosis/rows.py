@@ -15,20 +15,21 @@ from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
+from piezo_ident.common.arrays import Array, closed, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import COVERED
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.spectra import highest_frequency
-from piezo_ident.model.initial_memory import fit_start, is_at_rest, SWEPT
+from piezo_ident.model.initial_memory import begins_at_rest, fit_start, forgotten, SWEPT
 from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
+from piezo_ident.record.gaps import FEW
 from piezo_ident.record.record import Record
-from piezo_ident.residual.stretches import block_means, SPIKE, without_spikes
+from piezo_ident.residual.stretches import block_means
 
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
@@ -68,7 +69,8 @@ class Rows:
     m : int
         Samples in a row.
     keep : tuple of ndarray of bool
-        For each run, which rows count: sound, and all but wide plays off their start.
+        For each run, which rows count: most of their samples sound, and all but wide plays off
+        their start.
     x : ndarray, shape (n,)
         Measured displacement of the rows, normalised.
     block, of_record : ndarray of int, shape (n,)
@@ -246,12 +248,12 @@ def means(x: Array, of_record: Integers) -> Array:
 
 
 def make_rows(
-    model: StageModel, records: Sequence[Record], bad: Sequence[Mask | None] | None = None
+    model: StageModel, records: Sequence[Record], bad: Sequence[Mask] | None = None
 ) -> Rows:
     """
     Cut records into rows and blocks, by the scaling and sampling rate of a model.
 
-    `bad` are for each run samples that are not used, or None.  IdentificationError when no record
+    `bad` are for each run samples that are not used.  IdentificationError when no record
     has the sampling rate of the model, or nothing is left to judge.
     """
     runs = runs_of(records, model.sample_rate, model.scaling, SWEPT)
@@ -262,14 +264,16 @@ def make_rows(
             f'{", ".join(f"{r:g}" for r in rates)} Hz); record at that rate, or identify again'
         )
     names = tuple(dict.fromkeys(run.record for run in runs))
-    bad = bad or [None] * len(runs)
-    runs = [_cleaned(run, out) for run, out in zip(runs, bad, strict=True)]
-    use = [
-        run.known if out is None else run.known & ~out for run, out in zip(runs, bad, strict=True)
-    ]
-    samples = sum(int(known.sum()) for known in use)
+    for i, out in enumerate(bad or ()):
+        runs[i] = replace(runs[i], use=runs[i].use & ~out, known=runs[i].known & ~out)
+    at_rest = [begins_at_rest(model, run.piece, run.use) for run in runs]
+    for i, run in enumerate(runs):
+        if not at_rest[i]:
+            late = np.arange(run.u.size) >= forgotten(run.u, enough=SWEPT)
+            runs[i] = replace(run, known=run.known & late)
+    samples = sum(int(run.known.sum()) for run in runs)
     m = max(1, round(model.sample_rate / ROW_RATE), -(-samples // MOST_ROWS))
-    keep = tuple(np.all(known[: known.size // m * m].reshape(-1, m), axis=1) for known in use)
+    keep = tuple(_whole_rows(run.known, m) for run in runs)
     kept = sum(int(k.sum()) for k in keep)
     if kept < FEWEST:
         raise IdentificationError(
@@ -307,7 +311,7 @@ def make_rows(
         duration=max(
             run.piece.duration + (run.piece.start_time - first_of[run.record]) for run in runs
         ),
-        memories=tuple(_memory(model, run) for run in runs),
+        memories=tuple(_memory(model, *pair) for pair in zip(runs, at_rest, strict=True)),
         m=m,
         keep=keep,
         x=np.concatenate(x),
@@ -327,15 +331,11 @@ def _has_clock(model: StageModel) -> bool:
     return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
-def _cleaned(run: Run, out: Mask | None) -> Run:
-    """Return a run whose bad samples are no noise: a few are bridged, more say nothing."""
-    if out is None:
-        return run
-    long = np.zeros(out.size, dtype=bool)
-    for a, b in true_runs(out):
-        long[a:b] = b - a > SPIKE
-    use, known = run.use & ~long, run.known & ~long
-    return replace(run, x=without_spikes(run.x, out), use=use, known=known)
+def _whole_rows(known: Mask, m: int) -> Mask:
+    """Return which rows of m samples count: a few lost ones may be no more than half of a row."""
+    both = (x[: x.size // m * m].reshape(-1, m) for x in (known, closed(known, FEW)))
+    counts, whole = (x.sum(axis=1) for x in both)
+    return np.asarray((whole == m) & (2 * counts >= m))
 
 
 def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
@@ -385,9 +385,9 @@ def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str
     return group, tuple(names)
 
 
-def _memory(model: StageModel, run: Run) -> Memory:
+def _memory(model: StageModel, run: Run, at_rest: bool) -> Memory:
     u0 = float(run.u[0])
-    start = None if is_at_rest(model, run.piece) else fit_start(model, run.piece, run.use)
+    start = None if at_rest else fit_start(model, run.piece, run.use)
     if start is None or start.memory is None:
         return lambda r: initial_memory(u0, r)
     at = np.concatenate([[0.0], model.hysteresis.thresholds])

@@ -19,9 +19,13 @@ from piezo_ident.model.initial_memory import early_part, fit_start
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
+from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
+
+#: level of small motion from which loops drift, in parts of the rms that H leaves of the triangles
+ELSEWHERE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +62,7 @@ def predictions_of(
         if start is None:
             start, judged = fit_start(model, run.piece, run.use), run.known
             if start is not None:
-                late = early_part(model, run.piece)
+                late = early_part(model, run.piece, memory=start.memory is not None)
                 judged = judged & (np.arange(judged.size) >= late)
         # a sensor may be set to zero between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
@@ -126,7 +130,7 @@ def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float,
     """
     if law == 'plays':
         excerpts = [run.excerpt(run.use) for run in runs]
-        swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+        swing = max(e.swing for e in excerpts)
         r = fine_thresholds(swing, swing / 10.0)
         R = factorise(excerpts, r, model.dynamics, model.delay)
         model = replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
@@ -148,11 +152,12 @@ def validation_errors(model: StageModel, records: Sequence[Record]) -> list[Erro
     """
     Return the free-run errors of records that were given for validation.
 
-    A record without a piece at the sampling rate of the model raises IdentificationError.
+    Readings that `without_faults` left out are not judged.  A record without a piece at the
+    sampling rate of the model raises IdentificationError.
     """
     rows: list[ErrorRow] = []
     for record in records:
-        runs = runs_of([record], model.sample_rate, model.scaling)
+        runs = runs_of([with_quiet_voltage(record)], model.sample_rate, model.scaling)
         if not runs:
             raise IdentificationError(
                 f'{record.name}: no piece is sampled at {model.sample_rate:g} Hz, the rate of the '
@@ -162,3 +167,40 @@ def validation_errors(model: StageModel, records: Sequence[Record]) -> list[Erro
         judged = errors_of(predictions_of(model, runs), nothing)
         rows += [replace(row, data='validation') for row in judged]
     return rows
+
+
+def _residual(model: StageModel, run: Run) -> Array:
+    """Return what a model leaves of a run [m]."""
+    memory = run.start(model.hysteresis.thresholds)
+    return run.piece.y - model.predict_piece(run.piece, memory)
+
+
+def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
+    """
+    Return whether small motion goes to another level than the triangles tell.
+
+    Small loops of a stage that is no sum of plays do not close: steps and noise drift towards the
+    middle of the large loop, and a triangle does not show it.
+    """
+    for run in runs:
+        e = _residual(model, run)
+        sweeps, small = (
+            e[run.mask(*kinds) & run.known & ~run.held_out()]
+            for kinds in (('triangle',), ('step', 'settle', 'noise'))
+        )
+        if sweeps.size and small.size:
+            beside = float(small.mean() - sweeps.mean())
+            if abs(beside) > ELSEWHERE * float(sweeps.std()):
+                return True
+    return False
+
+
+def squares_left(model: StageModel, runs: Sequence[Run]) -> float:
+    """Return the sum of squares that a model leaves of what chooses, offsets apart [m^2]."""
+    left = 0.0
+    for run in runs:
+        kept = run.held_out() & run.use
+        if kept.any():
+            e = _residual(model, run)[kept]
+            left += float(np.sum((e - e.mean()) ** 2))
+    return left

@@ -185,7 +185,7 @@ def _held_blocks(e: Excerpt, size: int) -> Mask:
     """Return blocks all over the samples that count; a short stretch is one block."""
     held = np.zeros(e.use.size, dtype=bool)
     i = 0
-    for start, stop in e.stretches:
+    for start, stop in e.joined:
         count = max(1, round((stop - start) / size))
         edges = np.linspace(start, stop, count + 1).astype(int)
         for a, b in itertools.pairwise(edges):
@@ -197,7 +197,7 @@ def _held_blocks(e: Excerpt, size: int) -> Mask:
 def _cut(w: Array, x: Array, use: Mask, warm_up: int) -> list[Excerpt]:
     """Return the samples that count with what comes before them, without the rest."""
     pieces: list[list[int]] = []
-    for start, stop in Excerpt(w, x, use).stretches:
+    for start, stop in Excerpt(w, x, use).joined:
         begin = max(0, start - warm_up)
         if pieces and begin <= pieces[-1][1]:
             pieces[-1][1] = stop

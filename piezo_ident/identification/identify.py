@@ -18,17 +18,25 @@ import platform
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
     fast_error,
     key_of,
+    moves_on,
     noise_floor_of,
+    Prediction,
     predictions_of,
+    squares_left,
     validation_errors,
 )
-from piezo_ident.identification.prepare import Excerpt, prepare, Run
+from piezo_ident.identification.prepare import (
+    Excerpt,
+    fault_lines,
+    filled_in,
+    prepare,
+    Run,
+)
 from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import (
     DynamicsResult,
@@ -60,11 +68,10 @@ from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 import scipy
 
-#: level of small motion from which loops drift, in parts of the rms that H leaves of the triangles
-ELSEWHERE = 2.0
 #: share by which a model may err more without a pair of G that H may stand for
 AS_WELL = 0.01
 #: largest orders that are tried then, too
@@ -134,17 +141,27 @@ def _identify(
     steps: Steps | None,
 ) -> Identification:
     data = prepare(records)
+    validation = [without_faults(record) for record in validation]
     runs, scaling = data.runs, data.scaling
     refuse_delay(data.pieces, settings.delay)
-    if data.labelled:
-        fit = _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
-    elif steps is not None:
+    if not data.labelled and steps is not None:
         raise IdentificationError(_UNLABELLED.format('hysteresis', 'noise and triangle'))
-    else:
-        fit = fit_unlabelled(runs, data.rate, scaling, settings, progress)
+
+    def fitted(runs: Sequence[Run]) -> FitOutcome:
+        if data.labelled:
+            return _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
+        return fit_unlabelled(runs, data.rate, scaling, settings, progress)
+
+    def predicted(fit: FitOutcome) -> tuple[StageModel, list[Prediction]]:
+        judged, memories = fit.judged or (fit.model, fit.memories)
+        return judged, predictions_of(judged, runs, memories, fit.offsets)
+
+    fit = fitted(runs)
+    if any(piece.sound is not None for piece in data.pieces):
+        # a regression of fast motion needs better than straight lines over what was lost
+        fit = fitted([filled_in(p.run, p.y_hat, scaling) for p in predicted(fit)[1]])
     model, stroke = fit.model, abs(scaling.Y)
-    judged, memories = fit.judged or (model, fit.memories)
-    predictions = predictions_of(judged, runs, memories, fit.offsets)
+    judged, predictions = predicted(fit)
     floor = noise_floor_of(predictions)
     result = Identification(
         model=model,
@@ -155,10 +172,15 @@ def _identify(
         noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
         noise_source=floor.source,
         stroke=stroke,
-        warnings=(*data.warnings, *fit.warnings, *warn_of_shape(predictions, scaling)),
+        warnings=(
+            *data.warnings,
+            *fault_lines(validation),
+            *fit.warnings,
+            *warn_of_shape(predictions, scaling),
+        ),
         not_identified=tuple(fit.not_identified),
         settings=settings,
-        records=(*records, *validation),
+        records=(*data.records, *validation),
         memories=fit.memories,
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
@@ -188,11 +210,11 @@ def _labelled(
         fitted_to: Sequence[Excerpt] = fit
         hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
         model = model_of(rate, scaling, hysteresis, G, delay)
-        if hysteresis.law == 'plays' and settings.thresholds is None and _moves_on(model, runs):
+        if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
             motion = motion_excerpts(runs)
             other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
-            left = _left(model_of(rate, scaling, other, G, delay), runs)
-            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * _left(model, runs):
+            left = squares_left(model_of(rate, scaling, other, G, delay), runs)
+            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
                 hysteresis, fitted_to = other, motion
         if hysteresis.law != 'plays':
             # G was found beside plays
@@ -201,7 +223,7 @@ def _labelled(
                 dynamics, G = refined
                 hysteresis = fit_again(hysteresis, fitted_to, G, delay)
         model = model_of(rate, scaling, hysteresis, G, delay)
-        return _Fitted(runs, fit, held, dynamics, hysteresis, model, _left(model, runs))
+        return _Fitted(runs, fit, held, dynamics, hysteresis, model, squares_left(model, runs))
 
     best = fitted(*(steps.dynamics or second_step(runs, delay, settings, progress)), lean=False)
     if without_pairs(best.model.dynamics, rate).a.size < best.model.dynamics.a.size:
@@ -221,7 +243,7 @@ def _labelled(
     missing: dict[str, str] = {}
     is_given = delay_result.source == 'given'
     without = replace(model.without_dynamics(), delay=delay if is_given else Delay(0))
-    left = _left(without, runs)
+    left = squares_left(without, runs)
     if best.left > left:
         reason = (
             f'with {"it" if is_given else "both"} the model errs {np.sqrt(best.left / left):.4g} '
@@ -239,8 +261,8 @@ def _labelled(
             f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
         )
     warnings += warn_of_delay(delay_result)
-    lowest = min(float(e.u[e.use].min()) for e in fit)
-    highest = max(float(e.u[e.use].max()) for e in fit)
+    lowest = min(e.span[0] for e in fit)
+    highest = max(e.span[1] for e in fit)
     if lowest > 0.01 or highest < 0.99:
         warnings.append(
             'the triangle does not cover the voltages of the record: it reaches '
@@ -271,43 +293,6 @@ class _Fitted:
     hysteresis: HysteresisFit
     model: StageModel
     left: float
-
-
-def _residual(model: StageModel, run: Run) -> Array:
-    """Return what a model leaves of a run [m]."""
-    memory = run.start(model.hysteresis.thresholds)
-    return run.piece.y - model.predict_piece(run.piece, memory)
-
-
-def _moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
-    """
-    Return whether small motion goes to another level than the triangles tell.
-
-    Small loops of a stage that is no sum of plays do not close: steps and noise drift towards the
-    middle of the large loop, and a triangle does not show it.
-    """
-    for run in runs:
-        e = _residual(model, run)
-        sweeps, small = (
-            e[run.mask(*kinds) & run.known & ~run.held_out()]
-            for kinds in (('triangle',), ('step', 'settle', 'noise'))
-        )
-        if sweeps.size and small.size:
-            beside = float(small.mean() - sweeps.mean())
-            if abs(beside) > ELSEWHERE * float(sweeps.std()):
-                return True
-    return False
-
-
-def _left(model: StageModel, runs: Sequence[Run]) -> float:
-    """Return the sum of squares that a model leaves of what chooses, offsets apart [m^2]."""
-    left = 0.0
-    for run in runs:
-        kept = run.held_out() & run.use
-        if kept.any():
-            e = _residual(model, run)[kept]
-            left += float(np.sum((e - e.mean()) ** 2))
-    return left
 
 
 def first_steps(

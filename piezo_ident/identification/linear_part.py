@@ -106,7 +106,7 @@ def _factor(motion: FastMotion, na: int, lags: int) -> ArxFactor | None:
     parts = [
         (e.u[start:stop], e.x[start:stop])
         for e in motion.whole
-        for start, stop in e.stretches
+        for start, stop in e.joined
         if stop - start >= 3 * width
     ]
     factor = factor_of(parts, na, lags) if parts else None

@@ -6,22 +6,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask, true_runs
+from piezo_ident.common.arrays import Array, closed, interpolated, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
-from piezo_ident.record.faults import suspicions, without_faults
-from piezo_ident.record.first_rise import rises_first
-from piezo_ident.record.gaps import bridged
+from piezo_ident.record.faults import without_faults
+from piezo_ident.record.gaps import bridged, FEW
 from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.suspicions import rises_first, suspicions
 
 #: share of a triangle that is one block of held-out data, and how many blocks share one
 BLOCKS, EVERY = 60, 5
@@ -31,6 +31,9 @@ END_HELD = 0.2
 REST = 0.01
 #: how far the voltage may move within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
+#: samples in a row whose readings may be lost where the voltage turns (taste; held-out blocks,
+#: which hold no turn, are longer)
+LOST = 50
 #: samples of all records that are used, at some 60 bytes each; of longer ones the first
 MOST_SAMPLES = 40_000_000
 
@@ -68,12 +71,41 @@ class Excerpt:
         return true_runs(self.use)
 
     @functools.cached_property
+    def joined(self) -> list[tuple[int, int]]:
+        """
+        The stretches, which go on over a few samples that do not count.
+
+        Lost readings do no harm where a regression runs through the straight line in their place.
+        """
+        return true_runs(closed(self.use, FEW))
+
+    @functools.cached_property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest input of the stretches: a lost reading has its voltage."""
+        u = self.u[closed(self.use, LOST)]
+        return (float(u.min()), float(u.max())) if u.size else (np.inf, -np.inf)
+
+    @property
+    def swing(self) -> float:
+        """Width of `span`; zero where no sample counts."""
+        return max(self.span[1] - self.span[0], 0.0)
+
+    @functools.cached_property
+    def averaged(self) -> list[tuple[int, int]]:
+        """
+        The stretches whose rows are averaged, which go on over gaps shorter than a row.
+
+        Within a row the voltage hardly moves, and a straight line is what the stage does.
+        """
+        return true_runs(closed(self.use, min(FEW, self.row - 1)))
+
+    @functools.cached_property
     def row(self) -> int:
         """Samples that one row of a fit of H may average."""
         if not self.use.any():
             return 1
         speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
-        span = ROW_SPAN * float(np.ptp(self.u[self.use]))
+        span = ROW_SPAN * self.swing
         return max(
             1, min(int(span / speed) if speed > 0.0 else 1, int(self.use.sum()) // 10_000, 50)
         )
@@ -81,7 +113,7 @@ class Excerpt:
     @property
     def rows(self) -> int:
         """Rows that these samples become; white noise is independent from row to row."""
-        return sum((stop - start) // self.row for start, stop in self.stretches)
+        return sum((stop - start) // self.row for start, stop in self.averaged)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,7 +159,7 @@ class Run(Excerpt):
         """
         whole = np.ones(stop - start, dtype=bool)
         for a, b in true_runs(~self.use[start:stop]):
-            if b - a > 0.0125 * self.piece.sample_rate:
+            if b - a > max(FEW, 0.0125 * self.piece.sample_rate):
                 whole[a:b] = False
         return [(start + a, start + b) for a, b in true_runs(whole)]
 
@@ -160,6 +192,8 @@ class Prepared:
     rate : float
         [Hz]
     scaling : Scaling
+    records : list of Record
+        The records, their faulty readings left out.
     pieces : list of Piece
         Of this rate.
     runs : list of Run
@@ -170,6 +204,7 @@ class Prepared:
 
     rate: float
     scaling: Scaling
+    records: list[Record]
     pieces: list[Piece]
     runs: list[Run]
     warnings: list[str]
@@ -204,12 +239,7 @@ def prepare(records: Sequence[Record]) -> Prepared:
         refuse_closed_loop(record)
     pieces = [p for record in records for p in record if same_rate(p.sample_rate, rate)]
     scaling = scaling_of(pieces)
-    faults = [
-        f'{record.name}: {fault}'
-        for record in records
-        for fault in record.faults
-        if not fault.is_note
-    ]
+    faults = fault_lines(records)
     for record in records:
         parts = bridged(record)
         gaps, filled = sum(p.gaps for p in parts), sum(p.filled for p in parts)
@@ -222,7 +252,23 @@ def prepare(records: Sequence[Record]) -> Prepared:
             )
     # of columns that are swapped, v has the noise of a sensor
     faults += [text for record in measured for text in suspicions(record)]
-    return Prepared(rate, scaling, pieces, runs_of(records, rate, scaling), faults + left)
+    runs = runs_of(records, rate, scaling)
+    return Prepared(rate, scaling, measured, pieces, runs, faults + left)
+
+
+def filled_in(run: Run, simulated: Array, scaling: Scaling) -> Run:
+    """
+    Return a run in which a simulated displacement [m] stands in for what was not measured.
+
+    What it leaves of the samples around goes on in between by a straight line.
+    """
+    y = simulated + interpolated(run.piece.y - simulated, ~run.use)
+    return replace(run, x=scaling.x(y), piece=replace(run.piece, y=y))
+
+
+def fault_lines(records: Sequence[Record]) -> list[str]:
+    """Return what was wrong with records, a line for each fault."""
+    return [f'{r.name}: {fault}' for r in records for fault in r.faults if not fault.is_note]
 
 
 def same_rate(one: float, other: float) -> bool:

@@ -309,7 +309,7 @@ def without_harm(
     Noise at one voltage hardly tells the memory that it starts with, and a wrong one bends all.
     """
     known = [replace(e, use=e.use & r.known) for e, r in zip(excerpts, runs, strict=True)]
-    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    swing = max(e.swing for e in excerpts)
     enough = all(_rise_and_fall(e.u[e.use]) > ENOUGH * swing for e in known)
     pairs = zip(excerpts, known, strict=True)
     if not enough or all(np.array_equal(a.use, b.use) for a, b in pairs):

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array, Integers, interpolated
 from piezo_ident.record.record import Piece
 
 #: the average response counts as risen at this many standard deviations of its noise
@@ -101,18 +101,30 @@ def step_responses(
     Return the step responses [m/V], one a row, and the height of each step [V].
 
     They reach from `before` samples ahead of each step to `after` behind it: shapes (repeats,
-    before + after) and (repeats,).
+    before + after) and (repeats,).  A lost reading is NaN.
     """
     rows, heights = [], []
     for piece in pieces:
         for k in find_jumps(piece.v, before, after):
             height = piece.v[k] - piece.v[k - 1]
-            y = piece.y[k - before : k + after]
+            near = slice(k - before, k + after)
+            y = np.where(piece.mask[near], piece.y[near], np.nan)
+            rest = np.flatnonzero(np.isfinite(y[:before]))
+            if rest.size < 3:
+                continue
             # the stage may still be settling; what it did before the step goes on under it
-            line = np.polynomial.Polynomial.fit(np.arange(before), y[:before], 1)
+            line = np.polynomial.Polynomial.fit(rest, y[rest], 1, domain=[0, before - 1])
             rows.append((y - line(np.arange(before + after))) / height)
             heights.append(abs(height))
     return np.array(rows).reshape(-1, before + after), np.array(heights)
+
+
+def _mean(responses: Array, weight: Array) -> Array:
+    """Return the weighted mean of step responses at each lag, of the readings that are known."""
+    known = np.isfinite(responses)
+    total = weight @ known
+    sums = weight @ np.where(known, responses, 0.0)
+    return interpolated(sums / np.where(total > 0.0, total, 1.0), total == 0.0)
 
 
 def _first_rise(mean: Array, before: int, rounding: float) -> tuple[int | None, float, float]:
@@ -157,7 +169,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
         return StepDelay(None, float('inf'), 0, float('nan'), float('nan'), lag, empty)
     # the noise of a response in m/V falls with its height, so weights go with the square of it
     weight = heights**2 / np.sum(heights**2)
-    mean = weight @ responses
+    mean = _mean(responses, weight)
     # what taking out a line leaves of a displacement that never moves
     largest = max(float(np.abs(piece.y).max()) for piece in pieces)
     rounding = 1e-12 * largest / float(heights.max())
@@ -168,7 +180,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     elif n > 2:
         left_out = [
             _first_rise(
-                np.delete(weight, i) @ np.delete(responses, i, 0) / (1 - weight[i]),
+                _mean(np.delete(responses, i, 0), np.delete(weight, i)),
                 before,
                 rounding,
             )

@@ -283,7 +283,7 @@ def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
     na, nb = start.a.size, start.b.size
     model = stabilised(start)
     first = max(na, nb)
-    spans = [(e, max(a, first), b - max(a, first)) for e in excerpts for a, b in e.stretches]
+    spans = [(e, max(a, first), b - max(a, first)) for e in excerpts for a, b in e.joined]
     for _ in range(REFINEMENTS):
         A, right = np.zeros((na + nb, na + nb)), np.zeros(na + nb)
         scale = np.zeros(na + nb)

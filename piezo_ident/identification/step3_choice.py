@@ -194,9 +194,9 @@ def choose_law(
     must err less: what creeps follows a triangle of one speed as if it lagged along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
-    low = min(float(e.u[e.use].min()) for e in excerpts)
-    high = max(float(e.u[e.use].max()) for e in excerpts)
-    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    low = min(e.span[0] for e in excerpts)
+    high = max(e.span[1] for e in excerpts)
+    swing = max(e.swing for e in excerpts)
     r = even_thresholds(swing, FINE)
     law_of = {name: HysteresisLaw(name, r, (low, high)) for name in LAWS}
     all_terms = HysteresisLaw('any', r, (low, high))
@@ -307,7 +307,7 @@ def third_step(
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit
-    swing = max(float(np.ptp(e.u[e.use])) for e in fitted)
+    swing = max(e.swing for e in fitted)
     choice = Choice(None)
     if settings.thresholds is None and settings.solver == 'least_squares' and not plays:
         choice = choose_law(

@@ -128,7 +128,7 @@ def filtered_rows(
     G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
     for i, excerpt in enumerate(excerpts):
         row, memory = excerpt.row, excerpt.start(r).copy()
-        stretches = np.array(excerpt.stretches, dtype=np.int64).reshape(-1, 2)
+        stretches = np.array(excerpt.averaged, dtype=np.int64).reshape(-1, 2)
         n = excerpt.rows
         block = np.zeros((k + law.size + 1, n))
         block[i] = np.sqrt(row)

@@ -245,7 +245,7 @@ def second_step(
     G = fast_part(first, rate, lean)
 
     excerpts = triangle_excerpts(runs)
-    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts)
+    swing = max(e.swing for e in excerpts)
     excursion = float(np.ptp(run.u[start:stop]))
     r = fine_thresholds(swing, excursion)
 

@@ -108,7 +108,7 @@ def joint_fit(
         When the voltage hardly moves.
     """
     excerpts = [run.excerpt(run.use & mask) for run, mask in zip(runs, fitted, strict=True)]
-    swing = max(float(np.ptp(e.u[e.use])) for e in excerpts if e.use.any())
+    swing = max(e.swing for e in excerpts if e.use.any())
     if swing < MOVES:
         raise IdentificationError(
             f'{runs[0].record}: the voltage moves by {swing:.1%} of its range in the fitted part; '
@@ -177,7 +177,7 @@ def joint_fit(
             (e.u[a:b], w[a:b], e.x[a:b])
             for e, w, run, mask in zip(excerpts, undone, runs, fitted, strict=True)
             # a rest before a jump belongs to it
-            for a, b in true_runs(run.use & mask)
+            for a, b in run.excerpt(run.use & mask).joined
         ],
         rate,
     )

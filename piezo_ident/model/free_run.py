@@ -37,7 +37,7 @@ class FreeRunErrors:
     Attributes
     ----------
     n : int
-        Samples judged.
+        Samples judged: neither before a start that is estimated nor faulty readings.
     percent : float
         `piezo_ident.model.metrics.percent_of_stroke`, by the stroke of the whole record.
     fit : float
@@ -73,7 +73,7 @@ class FreeRun(Showable):
     Attributes
     ----------
     record : Record
-        Without its faulty readings; its faults count them.
+        Its masks leave out the faulty readings; its faults count them.
     pieces : tuple of ndarray
         Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
@@ -174,7 +174,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
         estimated=tuple(estimated),
         late=tuple(late),
         errors=_errors(record, predicted, [0] * len(late)),
-        errors_after_start=_errors(record, predicted, late) if sum(late) < record.n else None,
+        errors_after_start=_errors(record, predicted, late) if _judged(record, late) else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
 
@@ -186,7 +186,7 @@ def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
     Of the whole record where no such sample is.
     """
     late = [max(starts) for starts in zip(*(run.late for run in runs), strict=True)]
-    if sum(late) == runs[0].record.n:
+    if not _judged(runs[0].record, late):
         return [run.errors for run in runs]
     return [_errors(run.record, run.pieces, late) for run in runs]
 
@@ -222,7 +222,8 @@ def _late(model: StageModel, piece: Piece, start: Start) -> int:
     # a voltage that rests forgets nothing
     if start.memory is not None and np.ptp(piece.v) == 0.0:
         return piece.n
-    return early_part(model, piece) if start.memory is not None or start.creep.size else 0
+    memory = start.memory is not None
+    return early_part(model, piece, memory=memory) if memory or start.creep.size else 0
 
 
 def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:
@@ -281,18 +282,23 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
     return predicted
 
 
+def _judged(record: Record, starts: Sequence[int]) -> int:
+    """Return how many samples count, of each piece from a sample on."""
+    return sum(int(piece.mask[start:].sum()) for piece, start in zip(record, starts, strict=True))
+
+
 def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -> FreeRunErrors:
     """Return the errors of each piece from a sample on, in blocks for the sake of memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
     def total(f: Callable[[Array, Array], Array]) -> float:
         return sum(
-            float(np.sum(f(piece.y[i : i + BLOCK], y_hat[i : i + BLOCK])))
+            float(np.sum(f(piece.y[part], y_hat[part])[piece.mask[part]]))
             for piece, y_hat, start in pieces
-            for i in range(start, piece.n, BLOCK)
+            for part in (slice(i, i + BLOCK) for i in range(start, piece.n, BLOCK))
         )
 
-    n = record.n - sum(starts)
+    n = _judged(record, starts)
     offset, mean = total(lambda y, y_hat: y - y_hat) / n, total(lambda y, y_hat: y) / n
     square = total(lambda y, y_hat: (y - y_hat) ** 2)
     centred = total(lambda y, y_hat: (y - y_hat - offset) ** 2)
@@ -336,7 +342,7 @@ def piece_runs(
     known = memories or {}
     runs = []
     for record in [records] if isinstance(records, Record) else records:
-        record = with_quiet_voltage(record)
+        record = with_quiet_voltage(without_faults(record))
         for pieces, one in zip(connected_pieces(record), bridged(record), strict=True):
             if not model.takes(pieces[0]):
                 continue

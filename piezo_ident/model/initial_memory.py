@@ -30,9 +30,9 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.record.first_rise import rises_first
 from piezo_ident.record.gaps import connected_pieces
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.suspicions import rises_first
 from scipy.optimize import lsq_linear
 
 #: share of its range that the voltage must sweep until the start is forgotten
@@ -56,6 +56,10 @@ CREEP_PULL = 1e-8
 FAR = 1e3
 #: share of a record from which creep of earlier motion is estimated, at least
 EARLY = 0.2
+#: a stage had not come down to the lowest voltage where a start at rest errs by so many times as
+#: much on the early part as behind it, and by this share of the span, and another start leaves
+#: this share of it (level of the test: a model that errs alike everywhere stays at rest)
+ERRS, SEEN, LEAVES = 2.0, 1e-3, 0.5
 #: rms that creep of earlier motion must leave there, over that without it, the zero free
 WORTH = 0.9
 #: and what it must gain, in spans
@@ -133,10 +137,34 @@ def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
     )
 
 
-def early_part(model: StageModel, piece: Piece) -> int:
-    """Return the number of samples from which what was before a piece is estimated."""
-    creeps, end = _creeps(model), 10
+def begins_at_rest(
+    model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
+) -> bool:
+    """
+    Return whether a piece starts near the lowest voltage, and goes on as if it had come down.
+
+    A stage that rises for the first time errs there, and no more once the start is forgotten.
+    """
     if not is_at_rest(model, piece):
+        return False
+    end = early_part(model, piece, memory=True)
+    part = piece.cut(0, min(2 * end, piece.n))
+    use = part.mask if sound is None else sound[: part.n]
+    early, late = (np.flatnonzero(use[a:b]) + a for a, b in ((0, end), (end, part.n)))
+    if min(early.size, late.size) < 10 or not model.hysteresis.thresholds.size:
+        return True
+    e = model.scaling.x(part.y) - model.scaling.x(model.predict_piece(part))
+    at_rest = float(np.sqrt(np.mean((e[early] - e[late].mean()) ** 2)))
+    if at_rest < max(ERRS * float(np.std(e[late])), SEEN):
+        return True
+    left = _fit(model, piece, sound, memory=True)[1]
+    return float(np.sqrt(np.mean(left**2))) > LEAVES * at_rest
+
+
+def early_part(model: StageModel, piece: Piece, *, memory: bool) -> int:
+    """Return the number of samples from which creep, or the `memory`, before is estimated."""
+    creeps, end = _creeps(model), 10
+    if memory:
         # later, what was before the start is forgotten; wide plays and creep look alike
         enough = np.inf if creeps else SWEPT * float(np.ptp(model.scaling.range))
         end = max(forgotten(piece.v, way=forgetting(model), enough=enough), end)
@@ -164,7 +192,7 @@ def fit_start(
     Start or None
         None for a stage that was at rest at the lowest voltage, as far as the data tell.
     """
-    known = is_at_rest(model, piece)
+    known = begins_at_rest(model, piece, sound)
     creeps = _creeps(model)
     if known and not creeps:
         return None
@@ -217,7 +245,7 @@ def _fit(
 ) -> tuple[Start, NDArray[np.float64]]:
     """Return a start by least squares on the early part, and what it leaves of some samples."""
     h = model.hysteresis
-    part = piece.cut(0, early_part(model, piece))
+    part = piece.cut(0, early_part(model, piece, memory=memory))
     # the plays follow the voltage behind the effects of the input slot
     u = model.hysteresis_input(part)
     u0 = float(u[0])

@@ -76,12 +76,15 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
             if s.stop - start < rate / frequency - 0.5:
                 continue
             steady = slice(start, s.stop)
-            y = run.piece.y[steady]
+            sound = run.piece.mask[steady]
+            y, y_hat, y_static = (x[steady][sound] for x in (run.piece.y, run.y_hat, run.y_static))
+            if not y.size:
+                continue
             rows.append(
                 SineError(
                     frequency=frequency,
-                    percent=percent_of_stroke(y, run.y_hat[steady]),
-                    static_percent=percent_of_stroke(y, run.y_static[steady]),
+                    percent=percent_of_stroke(y, y_hat),
+                    static_percent=percent_of_stroke(y, y_static),
                     n=y.size,
                 )
             )

@@ -23,9 +23,8 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.options import ReadOptions, split_unit, unit_factor, UNITS
-from piezo_ident.record.ordering import at_times, in_order, not_uniform, OrderedRows
+from piezo_ident.record.ordering import at_times, in_order, not_uniform, OrderedRows, unrounded
 from piezo_ident.record.record import Fault, Piece, Record, Segment
-from piezo_ident.record.rounded_time import unrounded
 
 #: label of each stretch and the row at which it begins; it lasts until the next begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]

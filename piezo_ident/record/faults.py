@@ -1,21 +1,26 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is wrong with measured data though every number in them is in order."""
+"""
+Readings that cannot be the stage's, though every number is in order: one mask, decided once.
+
+A reading is lost, wild, repeated or stuck.  The mask of a piece leaves it out of every fit, error,
+noise floor and stroke.  A straight line stands in for it where a filter or a regression needs all
+samples.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-import difflib
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array
-from piezo_ident.record.first_rise import rises_first
+from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
+from piezo_ident.record.channels import role_of
+from piezo_ident.record.jumps import AROUND, CODES, FAR, JUMP, Jumps, LEAST, RINGS
 from piezo_ident.record.ordering import at_times
-from piezo_ident.record.record import Fault, KINDS, Piece, Record
+from piezo_ident.record.record import Fault, Piece, Record
 
 Runs = list[tuple[int, int]]
 
@@ -25,161 +30,144 @@ STUCK = 50
 _CHUNK = 1 << 20
 #: share of its range by which the voltage moves meanwhile
 MOVED = 0.01
-#: a wild reading is off by this share of the stroke at least, and by so many of the steps that
-#: the readings around it take; so many of them are looked at on either side
-LEAST, FAR, AROUND = 2e-3, 8.0, 8
-#: and by so many codes of a converter, of which noise turns two
-CODES = 3.0
+#: the voltage is ahead of the displacement by this time at most [s]
+DELAY = 0.002
 #: share of the stroke to either end that is not the middle, of the range of the voltage that moves
 #: any stage there
 MIDDLE, FIRM = 0.02, 0.03
 #: samples in which noise is looked for
 WINDOW = 100
 #: readings of one value in a row that may be a sensor that hangs
-HELD = 10
+HELD = 2 * JUMP
+#: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
+CHANCE, CREEPS = 0.01, 3e-5
+#: repeats in a moving signal: at least so many, and this share of the samples that move; share of
+#: them behind which the signal makes up for them
+REPEATS, REPEATED, MADE_UP = 4, 2e-4, 0.7
 #: samples in which the step of a converter is looked for, in rows of so many
 MOST, MOST_ROW = 2**17, 2**10
 #: share of that step by which numbers in a file may be rounded
 ROUNDED = 0.07
-#: where more of a record than this looks wrong, single readings and ones that are held, it is the
-#: way of the data
-MAX_WILD, MAX_HELD = 0.05, 0.3
+#: where more of a record than this looks wrong, wild readings and ones that are held or repeated,
+#: it is the way of the data
+MAX_WILD, MAX_HELD = 0.15, 0.3
+#: times that the stroke is read again without what was wild
+TURNS = 5
 #: changes of a displacement, at least, that tell the rate of its sensor
 CHANGES = 100
 
 
 def without_faults(record: Record) -> Record:
     """
-    Return a record without readings that cannot be the stage's.
+    Return a record whose masks leave out the readings that cannot be the stage's.
 
-    Up to three wild or lost readings in a row, among quiet neighbours, are bridged by a straight
-    line.  Longer ones, where the sensor hangs or drops out, are left out, and the voltage there is
-    kept as that of samples without a number is.  What is found is counted in the faults of the
-    record; where nothing is, the same record is returned.
+    A straight line stands in for them, and for the voltage of a row that was lost as a whole.
+    What is found is counted in the faults of the record.  Where nothing is, or where the masks
+    were decided before, the same record is returned.
     """
-    stroke, span = record.stroke, float(np.ptp(record.voltage_range))
-    if stroke == 0.0:
+    span = float(np.ptp(record.voltage_range))
+    if record.stroke == 0.0 or any(piece.sound is not None for piece in record):
         return record
-    pieces: list[Piece] = []
-    met: dict[str, list[float]] = {}
-    counts: Counter[str] = Counter()
-    for piece in record:
-        wild = _wild(piece, stroke, span)
-        held = [run for run in _held(piece, stroke, span) if not _overlaps(run, wild)]
-        # a slow sensor holds every reading
-        period = _period(piece.y)
-        held = [(a, b) for a, b in held if b - a >= HELD * period or period == 1]
-        for runs, is_lost in ((wild, True), (held, False)):
-            for a, b in runs:
-                name = 'stuck' if not is_lost else 'lost' if piece.y[a] == 0.0 else 'outliers'
-                counts[name] += b - a
-                met.setdefault(name, []).append(float(piece.time(a, a + 1)[0]))
-        pieces += _bridged_over(piece, wild, span).without(held)
-    hangs = counts['stuck']
-    is_way = hangs > MAX_HELD * record.n or counts.total() - hangs > MAX_WILD * record.n
-    if not counts.total() or is_way or not pieces:
-        return record
-    faults = [
-        Fault(
-            name,
-            at_times(np.array(times)),
-            counts[name],
-            'left out, its voltage is kept, record split there'
-            if name == 'stuck'
-            else 'left out, bridged',
+    stroke = record.stroke
+    wild = [_wild(piece, stroke, span) for piece in record]
+    for _ in range(TURNS):
+        # many lost readings widen what is taken for the stroke
+        both = zip(record, wild, strict=True)
+        low, high = robust_range(interpolated(piece.y, bad) for piece, bad in both)
+        if high - low > 0.9 * stroke:
+            break
+        stroke = high - low
+        wild = [_wild(piece, stroke, span) for piece in record]
+    found: list[dict[str, Mask]] = []
+    for piece, bad in zip(record, wild, strict=True):
+        rest = replace(piece, y=interpolated(piece.y, bad))
+        lost = bad & (piece.y == 0.0)
+        stuck = _held(rest, stroke, span) & ~bad
+        repeated = _repeated(rest.y, bad | stuck)
+        found.append(
+            {'lost': lost, 'outliers': bad & ~lost, 'stuck': stuck, 'missed_samples': repeated}
         )
-        for name, times in met.items()
-    ]
+    counts = Counter({name: sum(int(one[name].sum()) for one in found) for name in found[0]})
+    hangs = counts['stuck'] + counts['missed_samples']
+    is_way = hangs > MAX_HELD * record.n or counts.total() - hangs > MAX_WILD * record.n
+    if not counts.total() or is_way:
+        return record
+    masks = [np.logical_or.reduce(list(one.values())) for one in found]
+    pieces = [_masked(p, bad, span) for p, bad in zip(record, masks, strict=True)]
+    faults = [_fault(name, count, record, found) for name, count in counts.items() if count]
     return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
 
 
-def least_step(y: Array) -> float:
-    """Return the least step from one reading [m] to the next, infinite where none moves."""
-    steps = np.abs(np.diff(y))
-    return float(steps[steps > 0.0].min(initial=np.inf))
+def _fault(name: str, count: int, record: Record, found: Sequence[dict[str, Mask]]) -> Fault:
+    times = [
+        float(piece.time(a, a + 1)[0])
+        for piece, one in zip(record, found, strict=True)
+        for a, _ in true_runs(one[name])
+    ]
+    what = {'stuck': 'the sensor hangs, ', 'missed_samples': 'repeat the reading before, '}
+    action = f'{what.get(name, "")}left out of every fit and error; the voltage is kept'
+    return Fault(name, at_times(np.array(times)), count, action)
 
 
-def wild_readings(
-    error: Array, stroke: float, step: float = np.inf, measured: Array | None = None
-) -> NDArray[np.bool_]:
-    """
-    Return which readings are wild, of measured minus predicted displacement [m].
-
-    What the voltage does is in the prediction; `step` is the `least_step` of what was `measured`.
-    A jump of the error is a wild reading only where the measured displacement makes it: a goal out
-    of reach jumps as well.
-
-    >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
-    >>> wild_readings(error, stroke=10.0).nonzero()[0]
-    array([9])
-    >>> bool(wild_readings(error, stroke=10.0, measured=np.zeros(19)).any())
-    False
-    """
-    wild = np.zeros(error.size, dtype=bool)
-    floor = max(LEAST * stroke, CODES * step if np.isfinite(step) else 0.0)
-    if error.size > 1 and np.abs(np.diff(error)).max() > floor:
-        for a, b in _alone(error, floor):
-            wild[a:b] = measured is None or _height(measured, a, b) > 0.5 * _height(error, a, b)
-    return wild
+def _masked(piece: Piece, bad: Mask, span: float) -> Piece:
+    """Return a piece with a mask, and straight lines for what it leaves out."""
+    if not bad.any():
+        return piece
+    v = piece.v
+    # a row that was lost as a whole has no voltage either
+    rows = bad & (v == 0.0) & (piece.y == 0.0)
+    if rows.any():
+        line = interpolated(v, rows)
+        v = np.where(rows & (np.abs(v - line) > 0.05 * span), line, v)
+    return replace(piece, v=v, y=interpolated(piece.y, bad), sound=~bad)
 
 
-def _height(x: Array, a: int, b: int) -> float:
-    """Return how far numbers lie off the line between their neighbours, at most."""
-    line = np.linspace(x[a - 1], x[b], b - a + 2)[1:-1]
-    return float(np.abs(x[a:b] - line).max())
+def _wild(piece: Piece, stroke: float, span: float) -> Mask:
+    """Return which readings of a piece jump away and come back while the voltage does not."""
+    y = piece.y
+    ranges = {k: np.ptp(x) for k, x in piece.channels.items() if role_of(k) == 'v'}
+    # the voltages as the displacement [m] that they ask for; other axes may move this one, too
+    asked = np.zeros(y.size)
+    signals = [(piece.v, span), *((piece.channels[k], float(ranges[k])) for k in ranges)]
+    for v, width in signals:
+        if width > 0.0:
+            steps = np.abs(np.diff(interpolated(v, (v == 0.0) & (y == 0.0)), prepend=v[0]))
+            asked = np.maximum(asked, steps * (stroke / width))
+    asked[0] = 0.0
+    delay = int(np.clip(round(DELAY * piece.sample_rate), 2, RINGS))
+    wild = Jumps.of(y, asked, _floor(y, stroke), stroke, delay).left_out()
+    return _marked(y, wild, LEAST * stroke)
 
 
-def _overlaps(run: tuple[int, int], others: Runs) -> bool:
-    return any(run[0] < b and a < run[1] for a, b in others)
+def _marked(y: Array, bad: Mask, least: float) -> Mask:
+    """Return which readings are bad, and all that have the one value that many bad ones have."""
+    values, counts = np.unique(y[bad], return_counts=True)
+    values = values[counts >= REPEATS]
+    if not values.size:
+        return bad
+    marked, quantum = bad.copy(), quantum_of(interpolated(y, bad))
+    for value in values:
+        same = y == value
+        # a rest, and a code that the signal passes as it does its neighbours, are no mark
+        for a, b in constant(y, HELD):
+            jumps = np.abs(y[[a, min(b, y.size - 1)]] - y[[max(a - 1, 0), b - 1]]) > max(
+                least, CODES * quantum
+            )
+            same[a:b] &= bool(jumps.all())
+        beside = np.count_nonzero((np.abs(y - value) <= 2.5 * quantum) & (y != value)) / 4
+        if np.count_nonzero(same & ~bad) > REPEATS + 3.0 * beside:
+            marked |= same
+    return marked
 
 
-def _wild(piece: Piece, stroke: float, span: float) -> Runs:
-    """Return up to three readings in a row that stand alone while the voltage says nothing."""
-    floor = _floor(piece, stroke)
-    found: Runs = []
-    for at in range(0, piece.n, _CHUNK):
-        start = max(0, at - AROUND - 4)
-        y = piece.y[start : at + _CHUNK + AROUND + 4]
-        for a, b in _alone(y, floor):
-            if start + a < at or start + a >= at + _CHUNK:
-                continue
-            near = slice(max(0, start + a - AROUND), start + b + AROUND)
-            v = np.delete(piece.v[near], np.s_[start + a - near.start : start + b - near.start])
-            height = abs(y[a] - y[a - 1])
-            # a pulse of the voltage may be answered by one of the stage
-            if span == 0.0 or np.ptp(v) / span < 0.5 * height / stroke:
-                found.append((start + a, start + b))
-    return found
+def _floor(y: Array, stroke: float) -> float:
+    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
+    steps = np.abs(np.diff(y[:_CHUNK]))
+    moved = steps[steps > 0.0]
+    return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
 
 
-def _alone(y: Array, floor: float) -> Runs:
-    """Return runs of up to three numbers that are far from their neighbours on both sides."""
-    found: Runs = []
-    taken = np.zeros(y.size, dtype=bool)
-    steps = np.abs(np.diff(y))
-    for length in (1, 2, 3):
-        n = y.size - length - 1
-        if n < 2:
-            break
-        before, after = y[:n], y[length + 1 :]
-        heights = [
-            np.abs(y[1 + j : 1 + j + n] - before - (after - before) * ((j + 1) / (length + 1)))
-            for j in range(length)
-        ]
-        height = np.minimum.reduce(heights)
-        likely = (height > floor) & (height > FAR * np.abs(after - before))
-        for k in np.flatnonzero(likely) + 1:  # first of the run
-            beside = [steps[max(0, k - 1 - AROUND) : k - 1], steps[k + length :][:AROUND]]
-            # one more wild reading nearby makes two large steps
-            usual = max((float(np.sort(x)[-3:][0]) for x in beside if x.size >= 3), default=np.inf)
-            run = slice(k, k + length)
-            if height[k - 1] > FAR * usual and not taken[run].any():
-                taken[run] = True
-                found.append((int(k), int(k) + length))
-    return sorted(found)
-
-
-def _held(piece: Piece, stroke: float, span: float) -> Runs:
+def _held(piece: Piece, stroke: float, span: float) -> Mask:
     """
     Return where the reading stays at one value, and jumps at the end to make up for it.
 
@@ -188,35 +176,33 @@ def _held(piece: Piece, stroke: float, span: float) -> Runs:
     a backlash may hold them.
     """
     y, v = piece.y, piece.v
-    floor = _floor(piece, stroke)
+    found = np.zeros(y.size, dtype=bool)
+    # a slow sensor holds every reading
+    period = period_of(y)
+    runs = [
+        (a, b)
+        for a, b in constant(y, HELD * period if period > 1 else HELD)
+        if a > 0 and b < piece.n
+    ]
+    if not runs or not span:
+        return found
+    floor = _floor(y, stroke)
     ends = float(y.min()), float(y.max())
     trembles = _trembles(y)
-    found: Runs = []
-    for a, b in _constant(y, HELD):
-        if a == 0 or b == piece.n:
-            continue
-        steps = np.abs(np.diff(y[max(0, a - AROUND) : a]))
-        behind = np.abs(np.diff(y[b : b + AROUND]))
-        usual = max(float(x.max(initial=0.0)) for x in (steps, behind))
+    for a, b in runs:
+        beside = np.abs(np.diff(y[max(0, a - AROUND) : a])), np.abs(np.diff(y[b : b + AROUND]))
+        usual = max(float(x.max(initial=0.0)) for x in beside)
         entry, leave = float(y[a] - y[a - 1]), float(y[b] - y[b - 1])
         least = max(floor, FAR * usual)
-        late = _late(piece, a, b)
-        drive = float(np.ptp(v[a:late])) / span if span else 0.0
-        around = np.concatenate([v[max(0, a - AROUND) : a], v[b : b + AROUND]])
-        outside = abs(float(np.median(v[a:b])) - float(np.median(around))) / span if span else 0.0
+        drive = float(np.ptp(v[a : end_of_rest(piece, a, b)])) / span
         hangs = drive > MOVED and abs(leave) > max(least, 0.3 * drive * stroke)
         if trembles and drive > FIRM and min(abs(y[a] - end) for end in ends) > MIDDLE * stroke:
             # for most of the time, as a delay may be long
             reach = float(np.ptp(np.quantile(v[a:b], (0.1, 0.9)))) / span
             hangs |= b - a >= STUCK and reach > FIRM and 0.3 * reach * stroke > floor
-        drops = (
-            min(abs(entry), abs(leave)) > least
-            and entry * leave < 0.0
-            and max(drive, outside) < 0.3 * min(abs(entry), abs(leave)) / stroke
-        )
-        if hangs or drops:
-            # what hangs repeats the last good reading
-            found.append((a if drops else a + 1, b))
+        if hangs:
+            # what hangs repeats the last good reading, unless it jumped there
+            found[a if abs(entry) > least else a + 1 : b] = True
     return found
 
 
@@ -232,126 +218,73 @@ def _trembles(y: Array) -> bool:
     return float(np.mean((turn > 0.3) & (goes_far > 0.03))) > 0.02 if turn.size else False
 
 
-def _late(piece: Piece, a: int, b: int) -> int:
+def _repeated(y: Array, known: Mask) -> Mask:
+    """
+    Return readings equal to the one before where those around say that the position moved.
+
+    The slope is that between the readings before and after the equal ones.
+    """
+    n = y.size
+    found = np.zeros(n, dtype=bool)
+    stroke, q = float(np.ptp(y)), quantum_of(y)
+    if n < WINDOW or stroke == 0.0 or period_of(y) > 1:
+        return found
+    # third differences leave little of smooth motion
+    sigma = max(white_noise(np.diff(y, 3), q), 1e-12 * stroke)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(y) != 0.0) + 1, [n]])
+    start, stop = edges[:-1], edges[1:]
+    inner = (start >= 1) & (stop < n) & ~known[np.minimum(start + 1, n - 1)]
+    start, stop = start[inner], stop[inner]
+    slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
+    density = q / (np.sqrt(4.0 * np.pi) * sigma)
+    # the slope is itself known to about half a deviation
+    least = 2.0 * np.sqrt(np.log(max(density / CHANCE, 1.0))) + 1.0
+    length = stop - start
+    # a missed reading is entered at speed, and behind it the signal makes up for it
+    sign = np.sign(y[stop] - y[start - 1])
+    before, after = sign * (y[start] - y[start - 1]), sign * (y[stop] - y[stop - 1])
+    makes_up = (after - before) / np.maximum(length - 1, 1)
+    for factor in (1.0, 1.5, 2.5, 4.0):
+        moving = slope > factor * max(least * sigma + 1.5 * q, CREEPS * stroke)
+        equal = moving & (before > 0.3 * slope) & (length > 1)
+        samples, count = int(length[moving].sum()), int((length - 1)[equal].sum())
+        distance = np.maximum(slope[moving] - 0.5 * sigma - q, 0.0) / (2.0 * sigma)
+        expected = float(np.sum(length[moving] * density * np.exp(-(distance**2))))
+        by_chance = 2.0 * expected + 6.0 * np.sqrt(expected)
+        if count < max(REPEATS, REPEATED * samples) or count <= by_chance:
+            continue
+        if float(np.mean(makes_up[equal] > 0.3 * slope[equal])) >= MADE_UP:
+            for a, b in zip(start[equal], stop[equal], strict=True):
+                found[a + 1 : b] = True
+            return found
+    return found
+
+
+def white_noise(third: Array, quantum: float) -> float:
+    """Return the rms of the noise of readings, from their third differences and their step."""
+    size = np.abs(third) / np.sqrt(20.0)
+    if size.size == 0:
+        return 0.0
+    # quantised readings may repeat more often than not, so a median could be zero
+    robust = 1.4826 * float(np.median(size))
+    usual = size[size <= max(5.0 * robust, 1.01 * quantum)]
+    return float(np.sqrt(np.mean(usual**2))) if usual.size else robust
+
+
+def end_of_rest(piece: Piece, a: int, b: int) -> int:
     """Return where a rest of the displacement ends for the voltage, which is ahead by a delay."""
-    return b - min((b - a) // 4, round(0.002 * piece.sample_rate))
+    return b - min((b - a) // 4, round(DELAY * piece.sample_rate))
 
 
-def _period(y: Array) -> int:
+def period_of(y: Array) -> int:
     """Return every how many samples a displacement, shape (n,), has a new reading."""
     changes = np.flatnonzero(np.diff(y))
     return int(np.gcd.reduce(np.diff(changes))) if changes.size > CHANGES else 1
 
 
-def _floor(piece: Piece, stroke: float) -> float:
-    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
-    steps = np.abs(np.diff(piece.y[:_CHUNK]))
-    moved = steps[steps > 0.0]
-    return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
-
-
-def _bridged_over(piece: Piece, runs: Runs, span: float) -> Piece:
-    if not runs:
-        return piece
-    y, v = piece.y.copy(), piece.v.copy()
-    for a, b in runs:
-        for x, is_wild in ((y, True), (v, False)):
-            line = np.linspace(x[a - 1], x[b], b - a + 2)[1:-1]
-            steps = np.abs(np.diff(x[max(0, a - AROUND) : a])).max(initial=0.0)
-            # a row that was lost as a whole has no voltage either
-            if is_wild or np.abs(x[a:b] - line).min() > max(FAR * steps, 0.05 * span):
-                x[a:b] = line
-    return replace(piece, v=v, y=y)
-
-
-def line_error(pieces: Iterable[Piece]) -> float:
-    """Return the error of the best straight line from v to y, rms in % of stroke."""
-    parts = list(pieces)
-    v, y = (np.concatenate(x) for x in ([p.v for p in parts], [p.y for p in parts]))
-    stroke = float(np.ptp(y))
-    if stroke == 0.0:
-        return 0.0
-    v, y = v - v.mean(), y - y.mean()
-    power = float(v @ v)
-    error = y - (float(v @ y) / power if power > 0.0 else 0.0) * v
-    return 100.0 * float(np.sqrt(np.mean(error**2))) / stroke
-
-
-def misspelt(labels: Sequence[str]) -> list[str]:
-    """Return 'x (did you mean y?)' for every label that is nearly a segment kind."""
-    found = []
-    for label in labels:
-        kind = label.partition(':')[0]
-        close = difflib.get_close_matches(kind.strip().lower(), KINDS, n=1, cutoff=0.75)
-        if kind not in KINDS and close:
-            found.append(f'{label} (did you mean {close[0]}?)')
-    return found
-
-
-def suspicions(record: Record) -> list[str]:
-    """Return what a record makes one suspect: a first rise, a sensor at its stop, and the like."""
-    return [*_first_rise(record), *_stopped(record), *_slow(record)]
-
-
-def _first_rise(record: Record) -> list[str]:
-    if not any(rises_first(piece) for piece in record):
-        return []
-    return [
-        f'{record.name}: the stage does not come back to where it began at '
-        f'{record.pieces[0].v[0]:g} V: it was not driven before, came from beyond that voltage, '
-        'or its zero moves. The memory at the start is fitted; a model that runs by itself '
-        'begins as a stage that came back. Drive it once over the range, and then record'
-    ]
-
-
-def _slow(record: Record) -> list[str]:
-    periods = [(_period(piece.y), _period(piece.v)) for piece in record]
-    m = max((y for y, v in periods if v < y), default=1)
-    if m == 1:
-        return []
-    return [
-        f'{record.name}: one reading of the displacement stands in {m} samples each: its sensor '
-        'is slower than the voltage, and neither delay nor fast motion are those of the stage. '
-        f'Record both at one rate, or keep one row in {m}, that with the new reading'
-    ]
-
-
-def _stopped(record: Record) -> list[str]:
-    span = float(np.ptp(record.voltage_range))
-    levels: list[float] = []
-    stuck = noisy = 0
-    for piece in record:
-        for start, stop in _constant(piece.y):
-            v = piece.v[start : _late(piece, start, stop)]
-            if np.ptp(v) > MOVED * span:
-                levels.append(float(piece.y[start]))
-                stuck += stop - start
-            # a command does not tremble, a sensor does
-            turns = np.diff(v)[1:] * np.diff(v)[:-1] < 0.0
-            noisy += stop - start if turns.mean() > 0.3 else 0
-    v_rests = any(_constant(piece.v) for piece in record)
-    if noisy > 0.02 * record.n and not v_rests:
-        return [
-            f'{record.name}: the displacement rests exactly while the voltage trembles: are the '
-            'columns v and y swapped?'
-        ]
-    if not levels:
-        return []
-    others = len(set(levels)) - 1
-    return [
-        f'{record.name}: the displacement stays at exactly {levels[0]:.9g} m'
-        f'{f" and {others} other values" if others else ""} for {stuck} samples while the voltage '
-        'moves: the sensor is at its stop, or hangs. Where these cells are empty (NaN), the '
-        'model follows the voltage, and is fitted to the rest'
-    ]
-
-
-def _constant(x: Array, least: int = STUCK) -> Runs:
+def constant(x: Array, least: int = STUCK) -> Runs:
     """Return the stretches of at least so many equal samples."""
-    same = np.concatenate([[False], x[1:] == x[:-1], [False]])
-    edges = np.flatnonzero(same[1:] != same[:-1]).reshape(-1, 2)
-    edges = edges[edges[:, 1] + 1 - edges[:, 0] >= least]
-    return [(int(a), int(b) + 1) for a, b in edges]
+    return [(a, b + 1) for a, b in true_runs(x[1:] == x[:-1]) if b + 1 - a >= least]
 
 
 def quantum_of(y: Array) -> float:

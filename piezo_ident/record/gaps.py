@@ -22,6 +22,8 @@ from piezo_ident.record.record import Piece, Record, Segment
 
 #: longest gap that is bridged by a straight line [s]
 LONGEST = 1.0
+#: lost readings in a row over which a regression or a spectrum may run
+FEW = 9
 #: time after a gap in which the dynamics may still answer to what was not measured [s]
 SETTLING = 0.01
 
@@ -31,7 +33,8 @@ class Bridged:
     """
     A piece with its gaps filled.
 
-    `sound` are the samples that were measured, and at which a gap before them has died away;
+    `sound` are the samples that were measured, are no fault, and at which a gap before them has
+    died away;
     `gaps` and `filled` are the number of gaps without a voltage, and of samples in them.
     """
 
@@ -80,7 +83,7 @@ def bridged(record: Record) -> list[Bridged]:
 def _joined(pieces: list[Piece]) -> Bridged:
     first = pieces[0]
     if len(pieces) == 1:
-        return Bridged(first, np.ones(first.n, dtype=bool))
+        return Bridged(first, first.mask)
     starts = [0]
     for one, other in itertools.pairwise(pieces):
         starts.append(starts[-1] + one.n + (follows(one, other) or 0))
@@ -101,6 +104,8 @@ def _joined(pieces: list[Piece]) -> Bridged:
     y, measured = fill([(start, p.y) for start, p in zip(starts, pieces, strict=True)])
     v, driven = fill([(start, p.v) for start, p in played])
     sound = measured.copy()
+    for piece, start in zip(pieces, starts, strict=True):
+        sound[start : start + piece.n] = piece.mask
     settle = max(1, round(SETTLING * first.sample_rate))
     for start in starts[1:]:
         sound[start : start + settle] = False
@@ -114,6 +119,7 @@ def _joined(pieces: list[Piece]) -> Bridged:
             channels={
                 k: fill([(start, p.channels[k]) for start, p in played])[0] for k in first.channels
             },
+            sound=sound if any(p.sound is not None for p in pieces) else None,
         ),
         sound=sound,
         gaps=len(true_runs(~driven)),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, frozen_array, robust_range
+from piezo_ident.common.arrays import Array, frozen_array, Mask, robust_range
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
@@ -95,6 +95,9 @@ class Piece:
         Further measured signals, for example temperature or another axis's voltage.
     before : Piece, optional
         The samples right before, of which everything but the displacement is known.
+    sound : array_like of bool, shape (n,), optional
+        False where a reading was no displacement of the stage, and a straight line stands in for
+        it; see `piezo_ident.record.faults.without_faults`.  None before that was judged.
 
     Raises
     ------
@@ -109,6 +112,7 @@ class Piece:
     segments: tuple[Segment, ...] = ()
     channels: Mapping[str, Array] = field(default_factory=dict)
     before: Piece | None = None
+    sound: Mask | None = None
 
     def __post_init__(self) -> None:
         v, y = frozen_array(self.v), frozen_array(self.y)
@@ -116,6 +120,8 @@ class Piece:
         if v.ndim != 1 or v.size == 0:
             raise DataError('a piece needs at least one sample of voltage and displacement')
         lengths = {'v': v.size, 'y': y.size, **{k: x.size for k, x in channels.items()}}
+        if self.sound is not None:
+            lengths['sound'] = np.size(self.sound)
         if len(set(lengths.values())) > 1:
             raise DataError(f'channels differ in length: {lengths}; give one value a sample')
         if not (np.isfinite(self.sample_rate) and self.sample_rate > 0):
@@ -136,6 +142,11 @@ class Piece:
     def n(self) -> int:
         """Number of samples."""
         return int(self.v.size)
+
+    @property
+    def mask(self) -> Mask:
+        """The samples whose displacement counts, shape (n,)."""
+        return np.ones(self.n, dtype=bool) if self.sound is None else self.sound
 
     @property
     def dt(self) -> float:
@@ -181,6 +192,7 @@ class Piece:
             segments=segments,
             channels={k: x[start:stop] for k, x in self.channels.items()},
             before=None if start else self.before,
+            sound=None if self.sound is None else self.sound[start:stop],
         )
 
     def without(self, runs: Iterable[tuple[int, int]]) -> list[Piece]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from piezo_ident.common.arrays import interpolated, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.dependence import Curve, curves_of
@@ -33,14 +32,15 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     """
     Look at the residual of a model from every side.
 
-    Faults of the data come first: missed readings and outliers are bridged, clipped ones left out
-    before anything else is read from the residual.  DataError when there is no sound sample.
+    Faults of the data come first: outliers and clipped readings are left out before anything else
+    is read from the residual.  DataError when there is no sound sample.
     """
     if not any(part.mask.any() for part in parts):
         raise DataError('there is no sound sample whose residual could be looked at')
     faults = find_faults(parts)
     clean = [
-        _repaired(p, bad, out) for p, bad, out in zip(parts, faults.bad, faults.out, strict=True)
+        ResidualPart(p.record, p.piece, p.e, p.mask & ~bad)
+        for p, bad in zip(parts, faults.bad, strict=True)
     ]
     stretches = all_stretches(clean)
     lines = find_lines(clean, stretches).lines
@@ -53,11 +53,3 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
         curves=curves_of(quiet, stretches),
         coherence=coherence(clean),
     )
-
-
-def _repaired(part: ResidualPart, bad: Mask, out: Mask) -> ResidualPart:
-    """Return a part with bad samples bridged, and without those that are to be left out."""
-    e = interpolated(part.e, bad, part.mask)
-    if e is part.e:
-        return part
-    return ResidualPart(part.record, part.piece, e, part.mask & ~out)

@@ -229,7 +229,7 @@ def _part_of(part: ResidualPart, channel: Array) -> _Part:
     m = max(1, int(part.piece.sample_rate / RATE))
     rate = part.piece.sample_rate / m
     e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, np.asarray(channel, np.float64)))
-    use = part.mask[: e.size * m].reshape(-1, m).all(axis=1) & np.isfinite(c)
+    use = part.joined[: e.size * m].reshape(-1, m).all(axis=1) & np.isfinite(c)
     use[: min(round(SETTLING * rate), e.size // 8)] = False
     c = np.where(np.isfinite(c), c, c[use].mean() if use.any() else 0.0)
     drive = np.hstack([drive_functions(v, rate), _slow(e.size)])

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data that a model shows: missed samples, jitter, outliers, clipping."""
+"""Faults of the data that a model shows: jitter, outliers, clipping, coarse steps, knocks."""
 
 from __future__ import annotations
 
@@ -11,27 +11,20 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
-from piezo_ident.record.faults import quantum_of
+from piezo_ident.record.faults import quantum_of, white_noise
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-#: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
-CHANCE, MOVED = 0.01, 3e-5
-#: repeats in a moving signal: at least so many, and this share of the samples that move
-REPEATS, REPEATED = 4, 2e-4
-#: share of the repeats behind which the signal makes up for them; share of a sensor that is slow
-MADE_UP, HELD = 0.7, 0.2
-#: a sensor hangs: equal readings, least motion of the model meanwhile, and share of the stroke by
-#: which no backlash lets it move; the reading then jumps by so many of the steps around it
-STUCK, HANGS, ALONE, AROUND = 20, 3.0, 0.05, 8
 #: least size of a knock, share of the stroke; most times of knocks that are given
 KNOCK, MOST_TIMES = 1e-4, 8
 #: a quantum is named above so many times the rest of the noise, and this share of the stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
 #: deviations of an outlier, and the largest share of it that its surroundings may show
 FAR, QUIET = 8.0, 0.35
+#: where more of a part than this is outliers, they are the way of the data
+MOST_OUTLIERS = 0.1
 #: samples at the end of a clipped range, deviations by which the model leaves it meanwhile
 FLAT, LEFT = 5, 6.0
 #: jitter: deviations of the slope, least growth of the variance, blocks of samples
@@ -47,75 +40,62 @@ class FaultSearch:
     """
     Faults found.
 
-    `bad` are for each part the samples that are missed, outliers or clipped, `out` the clipped
-    and those of a sensor that hangs among them, which no bridge can replace; `quantum` is the step
-    of the readings [m], 0 when there is none.
+    `bad` are for each part the samples to leave out; `quantum` is the step of the readings [m], 0
+    when there is none.
     """
 
     faults: tuple[Fault, ...]
     bad: tuple[Mask, ...]
-    out: tuple[Mask, ...]
     quantum: float
-
-    def left_out(self, share: float) -> list[Mask | None]:
-        """Return for each part the samples to leave out: `out`, and all bad ones up to a share."""
-        found = []
-        for bad, out in zip(self.bad, self.out, strict=True):
-            mask = bad if (bad & ~out).mean() < share else out
-            found.append(mask if mask.any() else None)
-        return found
 
 
 def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
-    """Look for the five faults: one fault for each part and kind."""
+    """
+    Look for outliers, clipping, coarse steps, jitter and knocks: one fault for each part and kind.
+
+    What the readings alone show is left out before, by `piezo_ident.record.faults`.
+    """
     faults: list[Fault] = []
-    bad: list[Mask] = []
-    out: list[Mask] = []
+    found: list[Mask] = []
     quantum = 0.0
     strokes = strokes_of(parts)
     for part in parts:
         stroke = strokes[part.record]
-        missed = clipped = outliers = stuck = np.zeros(part.piece.n, dtype=bool)
+        bad = np.zeros(part.piece.n, dtype=bool)
         if part.piece.n >= 100 and stroke > 0.0:
             noise = _noise_of(part)
             quantum = max(quantum, noise.quantum)
             clipped = _clipped(part, noise)
-            stuck = _stuck(part, noise, stroke) & ~clipped
-            missed = _missed(part, noise, stuck) | stuck
-            wide = binary_dilation(missed, iterations=3)
-            outliers = _outliers(part, noise, wide | clipped)
-            if missed.any():
-                # a reading that repeats the one before is no spike
-                outliers[1:] &= np.diff(part.piece.y) != 0.0
-            jitter, growth = _jitter(part, noise, wide | clipped | outliers)
+            outliers = _outliers(part, noise, clipped)
+            jitter, growth = _jitter(part, noise, clipped | outliers)
             if jitter > 0.0 and outliers.any():
                 # most of them may be readings at the wrong moment
-                outliers = _outliers(part, noise, wide | clipped, jitter)
-            faults += _masked(part, missed, outliers, clipped, stuck)
+                outliers = _outliers(part, noise, clipped, jitter)
+            many = float(outliers.mean()) > MOST_OUTLIERS
+            faults += _masked(part, outliers, clipped, many)
             faults += _of_all(part, stroke, noise, jitter, growth)
-            faults += _knocks(part, stroke, noise, missed | outliers | clipped)
-        bad.append(missed | outliers | clipped)
-        out.append(clipped | stuck)
-    return FaultSearch(tuple(faults), tuple(bad), tuple(out), quantum)
+            faults += _knocks(part, stroke, noise, outliers | clipped)
+            bad = clipped if many else outliers | clipped
+        found.append(bad)
+    return FaultSearch(tuple(faults), tuple(found), quantum)
 
 
-def _masked(
-    part: ResidualPart, missed: Mask, outliers: Mask, clipped: Mask, stuck: Mask
-) -> list[Fault]:
-    repeats = 'readings that repeat the one before in motion'
-    if stuck.any():
-        repeats += f', {len(true_runs(stuck))} of them stretches in which the sensor hangs'
+def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> list[Fault]:
+    action = 'left in, as they are the way of the data' if many else 'left out'
     return [
         Fault(
             name,
             f'in {part.record}, first at {part.piece.t[int(np.argmax(mask))]:.6g} s',
             int(mask.sum()),
-            f'{what}; to be left out',
+            what,
         )
         for name, mask, what in (
-            ('missed_samples', missed, repeats),
-            ('outliers', outliers, 'isolated jumps'),
-            ('clipping', clipped, 'readings at the end of their range while the model moves'),
+            ('outliers', outliers, f'isolated jumps; {action}'),
+            (
+                'clipping',
+                clipped,
+                'readings at the end of their range while the model moves; left out',
+            ),
         )
         if mask.any()
     ]
@@ -168,79 +148,9 @@ def _noise_of(part: ResidualPart) -> _Noise:
     """Return the fast noise of a part's readings; a model's misfit is too slow to matter."""
     y = part.piece.y
     quantum = quantum_of(y)
-    third = np.diff(part.e, 3)[part.mask[3:]] / np.sqrt(20.0)
-    if third.size == 0:
-        return _Noise(0.0, quantum, 0.0)
-    size = np.abs(third)
-    # quantised readings may repeat more often than not, so a median could be zero
-    robust = 1.4826 * float(np.median(size))
-    usual = size[size <= max(5.0 * robust, 1.01 * quantum)]
-    rms = float(np.sqrt(np.mean(usual**2))) if usual.size else robust
+    rms = white_noise(np.diff(part.e, 3)[part.mask[3:]], quantum)
     rest = float(np.sqrt(max(rms * rms - quantum * quantum / 12.0, 0.0)))
     return _Noise(rms, quantum, rest)
-
-
-def _stuck(part: ResidualPart, noise: _Noise, stroke: float) -> Mask:
-    """Return long stretches of one reading that jumps in the end, while the model moves on."""
-    y, y_hat = part.piece.y, part.y_hat
-    found = np.zeros(y.size, dtype=bool)
-    steps = np.abs(np.diff(y))
-    ends = float(y.min()), float(y.max())
-    for a, b in true_runs(steps == 0.0):
-        # readings a to b are equal
-        if b - a < STUCK or float(y[a]) in ends:
-            continue
-        way = np.abs(y_hat[a : b + 1] - y_hat[a])
-        moved, least = float(way.max()), LEFT * noise.rms + HANGS * noise.quantum + 1e-4 * stroke
-        if moved < least:
-            continue
-        around = np.concatenate([steps[max(0, a - AROUND) : a], steps[b + 1 : b + 1 + AROUND]])
-        jump = float(steps[b]) if b < steps.size else 0.0
-        if moved > ALONE * stroke or jump > AROUND * float(around.max(initial=0.0)):
-            # it may have been at rest before
-            found[a + 1 + int(np.argmax(way > 0.5 * least)) : b + 1] = True
-    return found & part.mask
-
-
-def _missed(part: ResidualPart, noise: _Noise, known: Mask) -> Mask:
-    """
-    Return readings equal to the one before where those around say that the position moved.
-
-    The slope is that between the readings before and after the equal ones, so no model is asked.
-    """
-    y, n = part.piece.y, part.piece.n
-    stroke = float(np.ptp(y))
-    found = np.zeros(n, dtype=bool)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(y) != 0.0) + 1, [n]])
-    start, stop = edges[:-1], edges[1:]
-    inner = (start >= 1) & (stop < n) & ~known[np.minimum(start + 1, n - 1)]
-    start, stop = start[inner], stop[inner]
-    slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
-    sigma, q = max(noise.rms, 1e-12 * stroke), noise.quantum
-    density = q / (np.sqrt(4.0 * np.pi) * sigma)
-    # the slope is itself known to about half a deviation
-    least = 2.0 * np.sqrt(np.log(max(density / CHANCE, 1.0))) + 1.0
-    length = stop - start
-    # a missed reading is entered at speed, and behind it the signal makes up for it
-    sign = np.sign(y[stop] - y[start - 1])
-    before, after = sign * (y[start] - y[start - 1]), sign * (y[stop] - y[stop - 1])
-    entered = before > 0.3 * slope
-    makes_up = (after - before) / np.maximum(length - 1, 1)
-    for factor in (1.0, 1.5, 2.5, 4.0):
-        moving = slope > factor * max(least * noise.rms + 1.5 * q, MOVED * stroke)
-        equal = moving & entered & (length > 1)
-        samples, count = int(length[moving].sum()), int((length - 1)[equal].sum())
-        distance = np.maximum(slope[moving] - 0.5 * sigma - q, 0.0) / (2.0 * sigma)
-        expected = float(np.sum(length[moving] * density * np.exp(-(distance**2))))
-        by_chance = 2.0 * expected + 6.0 * np.sqrt(expected)
-        if count < max(REPEATS, REPEATED * samples) or count <= by_chance:
-            continue
-        behind = float(np.mean(makes_up[equal] > 0.3 * slope[equal]))
-        if behind >= MADE_UP or count > HELD * samples:
-            for a, b in zip(start[equal], stop[equal], strict=True):
-                found[a + 1 : b] = True
-            return found & part.mask
-    return found
 
 
 def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.0) -> Mask:

@@ -137,7 +137,7 @@ def _motions(
     part: ResidualPart, used: Sequence[tuple[int, int]], m: int, shortest: float
 ) -> list[Series]:
     """Return what lies between the stretches used, freed of what the drive explains."""
-    piece, free = part.piece, part.mask.copy()
+    piece, free = part.piece, part.joined
     for start, stop in used:
         free[start:stop] = False
     runs = [(a, b) for a, b in true_runs(free) if b - a >= (shortest + 1) * m]
@@ -145,7 +145,7 @@ def _motions(
         return []
     tick = -round(piece.start_time * piece.sample_rate) % m
     e, v = (block_means(x[tick:], m) for x in (part.e, piece.v))
-    use: Mask = np.all(part.mask[tick : tick + e.size * m].reshape(-1, m), axis=1)
+    use: Mask = np.all(part.joined[tick : tick + e.size * m].reshape(-1, m), axis=1)
     e = without_drive(e, v, piece.sample_rate / m, use)
     found = []
     for start, stop in runs:

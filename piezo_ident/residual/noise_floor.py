@@ -19,6 +19,9 @@ ORDER = 3
 FRAME = 0.25
 #: share at the start of a rest that is left out, and at least this time [s]
 SETTLING, SETTLING_TIME = 0.2, 0.02
+#: share of its rms that the third differences of a white residual tell at least, and samples that
+#: are enough for it (level of the test: the estimate scatters by 2 % over so many)
+WHITE, FEWEST = 0.95, 2000
 #: most blocks a table of block lengths goes up to
 LONGEST_BLOCK = 4096
 
@@ -74,6 +77,20 @@ class NoiseFloor:
         slope = float(np.clip((y[-1] - y[k]) / (x[-1] - x[k]), -0.5, 0.0))
         return float(np.exp(y[-1] + slope * (at - x[-1])))
 
+    def squares(self, quantum: float, m: int, span: float) -> tuple[float, float | None]:
+        """
+        Return the mean squares in a row of m samples and in one, normalised by a span [m].
+
+        That of one is None where the floor is unknown; `quantum` is the step of the readings [m].
+        """
+
+        def square(rms: float, m: int) -> float:
+            # a reading that rests on one step of the converter hides its rounding
+            return float(max(rms, quantum / np.sqrt(12.0 * m)) / span) ** 2
+
+        single = None if self.rms is None else square(self.rms, 1)
+        return square(self.at(m) or 0.0, m), single
+
 
 @dataclass(frozen=True, eq=False)
 class _Reading:
@@ -93,7 +110,8 @@ def residual_noise_floor(
     period on, have twice the variance of the noise; whatever a model may lack repeats and drops
     out, and slow drift is taken from the differences.  Only without repeats are the rests taken:
     freed of parabolas in time and in its logarithm, which is how creep goes.  Of several stretches
-    the weighted median counts, so that one that is still settling does no harm.
+    the weighted median counts, so that one that is still settling does no harm.  Without either,
+    a residual that is white throughout is noise: no model leaves what has no memory.
 
     Notes
     -----
@@ -106,6 +124,24 @@ def residual_noise_floor(
         readings = [reading for reading in every if reading is not None]
         if readings:
             return _pooled(readings, kind)
+    return _white(parts)
+
+
+def _white(parts: Sequence[ResidualPart]) -> NoiseFloor:
+    """Return the floor of a residual that is white: its third differences tell all of it."""
+    own = [part.e[part.mask] - part.e[part.mask].mean() for part in parts if part.mask.any()]
+    third = [
+        np.diff(part.e, 3)[np.lib.stride_tricks.sliding_window_view(part.mask, 4).all(axis=1)]
+        for part in parts
+        if part.piece.n > 3
+    ]
+    n = sum(x.size for x in third)
+    if n >= FEWEST:
+        # of white noise the third difference has 20 times the variance
+        fast = float(np.sqrt(sum(float(x @ x) for x in third) / (20.0 * n)))
+        whole = float(np.sqrt(sum(float(x @ x) for x in own) / sum(x.size for x in own)))
+        if WHITE * whole <= fast <= whole / WHITE:
+            return NoiseFloor(min(fast, whole), f'the residual is white noise, {n} samples')
     return NoiseFloor(None, 'floor unknown: the voltage neither repeats three times nor rests')
 
 

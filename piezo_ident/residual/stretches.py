@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, interpolated, Mask, true_runs
+from piezo_ident.common.arrays import Array, closed, interpolated, Mask, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
+from piezo_ident.record.gaps import FEW
 from piezo_ident.record.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-#: bad samples in a row that say nothing of their neighbours
-SPIKE = 3
 #: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
 REST_TIME, REST_SAMPLES = 0.05, 200
 #: share of the differences of a measured voltage that reverse the one before while it rests
@@ -46,9 +45,10 @@ class ResidualPart:
     record : str
     piece : Piece
     e : ndarray, shape (n,)
-        Measured minus simulated displacement, free run [m].
+        Measured minus simulated displacement, free run [m].  Over a few samples in a row that are
+        not sound it becomes a straight line.
     sound : ndarray of bool, shape (n,), optional
-        False where samples were bridged, or the memory of the start still matters.
+        False where samples were bridged or lost, or the memory of the start still matters.
 
     Raises
     ------
@@ -73,6 +73,8 @@ class ResidualPart:
             raise DataError(
                 f'{self.record}: the residual is not finite everywhere; did the model diverge?'
             )
+        if not sound.all():
+            e = interpolated(e, closed(sound, FEW) & ~sound, sound)
         object.__setattr__(self, 'e', e)
         object.__setattr__(self, 'sound', sound)
 
@@ -90,9 +92,14 @@ class ResidualPart:
         """Return the same part with another residual."""
         return ResidualPart(self.record, self.piece, e, self.sound)
 
+    @property
+    def joined(self) -> Mask:
+        """The samples that count, and the few in a row between them that do not."""
+        return closed(self.mask, FEW)
+
     def runs(self) -> list[tuple[int, int]]:
-        """Return the unbroken stretches of sound samples, as first and behind the last."""
-        return true_runs(self.mask)
+        """Return the stretches of `joined` samples, as first and behind the last."""
+        return true_runs(self.joined)
 
 
 @dataclass(frozen=True)
@@ -115,14 +122,6 @@ class Stretch:
     def n(self) -> int:
         """Number of samples."""
         return self.stop - self.start
-
-
-def without_spikes(e: Array, bad: Mask) -> Array:
-    """Return a signal with a straight line over up to `SPIKE` bad samples in a row."""
-    spikes = np.zeros(e.size, dtype=bool)
-    for a, b in true_runs(bad):
-        spikes[a:b] = b - a <= SPIKE
-    return interpolated(e, spikes)
 
 
 def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:

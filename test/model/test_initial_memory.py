@@ -13,12 +13,19 @@ from paper_stage import FS, PAPER
 from piezo_ident.common.errors import ModelError
 from piezo_ident.model import initial_memory as memory_module
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.initial_memory import fit_start, forgetting, forgotten, is_at_rest
+from piezo_ident.model.initial_memory import (
+    begins_at_rest,
+    fit_start,
+    forgetting,
+    forgotten,
+    is_at_rest,
+)
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Piece, Record
+from programs import SLOW, slow_model
 import pytest
 
 V = 5 + 5 * np.sin(2 * np.pi * 10 * np.arange(4000) / FS)
@@ -269,3 +276,17 @@ def test_what_a_model_lacks_is_no_creep_of_earlier_motion(seed):
     run = free_run(CREEPING, Record((Piece(v, y, FS),)))
     still = 100 * np.sqrt(np.mean((y - CREEPING.simulate(v)) ** 2)) / np.ptp(y)
     assert run.errors.percent < 1.05 * still
+
+
+def test_a_first_rise_shows_also_where_the_voltage_never_rests():
+    rng, model = np.random.default_rng(3), slow_model()
+    knots = np.concatenate([[0.0], rng.uniform(0.0, 10.0, 40)])
+    v = np.interp(np.arange(8000) / 200.0, np.arange(41.0), knots)
+    noise = 2e-8 * rng.standard_normal(v.size)
+    fresh = Piece(v, model.stream(-model.hysteresis.thresholds).process(v) + noise, SLOW)
+    rested = Piece(v, model.simulate(v) + noise, SLOW)
+    assert begins_at_rest(model, rested) and not begins_at_rest(model, fresh)
+    # nor is a model that errs throughout a first rise, or a sensor with another zero
+    assert begins_at_rest(model, replace(rested, y=1.02 * rested.y + 1e-6))
+    run = free_run(model, Record((fresh,)))
+    assert run.errors.percent < 0.05 and run.late[0] > 0

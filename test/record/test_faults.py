@@ -9,11 +9,15 @@ from measured_data import DATA
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.operators.play import play_columns
-from piezo_ident.record.faults import line_error, misspelt, suspicions, without_faults
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.suspicions import line_error, misspelt, suspicions
+from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
+from scipy.signal import lfilter
 
 
 def triangle(noise=3e-9):
@@ -118,16 +122,19 @@ def test_wild_and_lost_readings_are_bridged_and_counted():
         assert np.sqrt(np.mean((record.pieces[0].y - truth) ** 2)) < 1e-3 * np.ptp(Y)
 
 
-def test_a_sensor_that_hangs_or_drops_out_is_cut_out():
+def test_a_sensor_that_hangs_or_drops_out_is_left_out():
     y = Y + 2e-9 * np.random.default_rng(1).normal(size=Y.size)
     y[50_000:52_000] = y[50_000]
     y[90_000:90_300] = 0.0
     record, counts = cleaned(y)
-    assert counts == {'stuck': 1999 + 300}
-    assert [p.n for p in record] == [50_001, 38_000, 109_700]
+    assert counts == {'stuck': 1999, 'lost': 300}
+    (piece,) = record.pieces
+    assert not piece.mask[50_001:52_000].any() and not piece.mask[90_000:90_300].any()
+    np.testing.assert_array_equal(piece.v, V)
+    assert without_faults(record) is record
     # a tenth of the record, too; where most of it is so, it is the way of the sensor
     y[100_000:117_000] = y[100_000]
-    assert cleaned(y)[1] == {'stuck': 1999 + 300 + 16_999}
+    assert cleaned(y)[1] == {'stuck': 1999 + 16_999, 'lost': 300}
 
 
 def test_a_sensor_hangs_also_while_the_voltage_goes_round():
@@ -225,3 +232,101 @@ def test_the_first_part_of_a_record_says_so():
     assert [p.n for p in part] == [200_000, 50_000]
     assert [(f.name, f.count) for f in part.faults] == [('part', 150_000)]
     assert record.first(400_000) is record
+
+
+# --- one mask, for every fit and every error ---------------------------------------------------
+
+PLAYED = parse_program(SLOW_PROGRAM).build(SLOW)
+NOISE = 5e-9
+
+
+def slow_record(offset=0.0, sound=True, **spoilt):
+    """Return a record of the slow stage, and which of its readings are no displacement."""
+    y = slow_model().simulate(PLAYED.v) + offset
+    y += NOISE * np.random.default_rng(0).standard_normal(y.size)
+    read, bad = (y, np.zeros(y.size, bool)) if sound else lossy(y, **spoilt)
+    return Record((Piece(PLAYED.v, read, SLOW, segments=PLAYED.segments),), 'slow'), bad
+
+
+def lossy(y, kind, share, length):
+    """Return readings of which runs are lost, wild, at full scale, or repeated."""
+    rng, bad = np.random.default_rng(5), np.zeros(y.size, bool)
+    while bad.mean() < share:
+        start = rng.integers(1, y.size - length)
+        bad[start : start + length] = True
+    values = {
+        'zero': np.zeros(y.size),
+        'full scale': np.full(y.size, y.max() + 2 * np.ptp(y)),
+        'wild': y.mean() + 3 * np.ptp(y) * rng.standard_normal(y.size),
+        'repeated': y[np.maximum.accumulate(np.where(bad, 0, np.arange(y.size)))],
+    }
+    return np.where(bad, values[kind], y), bad
+
+
+@pytest.mark.parametrize('offset', [0.0, 40e-6, -37e-6])
+@pytest.mark.parametrize('length', [1, 3, 7, 30])
+@pytest.mark.parametrize('kind', ['zero', 'full scale'])
+def test_a_tenth_of_the_readings_may_be_lost(kind, length, offset):
+    record, bad = slow_record(offset, sound=False, kind=kind, share=0.1, length=length)
+    piece = without_faults(record).pieces[0]
+    true = slow_record(offset)[0].pieces[0].y
+    left = (record.pieces[0].y - true)[piece.mask]
+    # a zero among zeros does no harm
+    assert np.sqrt(np.mean(left**2)) < NOISE
+    assert np.mean(~piece.mask & ~bad) < 0.005
+    assert without_faults(record).stroke == pytest.approx(np.ptp(true), rel=0.01)
+
+
+@pytest.mark.parametrize('length', [1, 3, 7])
+def test_wild_readings_that_no_voltage_asks_for_are_found(length):
+    record, bad = slow_record(sound=False, kind='wild', share=0.1, length=length)
+    mask = without_faults(record).pieces[0].mask
+    # what lies within the motion of the noise cannot be told from it
+    assert np.mean(~mask[bad]) > 0.98 and np.mean(~mask & ~bad) < 0.001
+
+
+@pytest.mark.parametrize(('share', 'least'), [(0.002, 0.5), (0.1, 0.6)])
+def test_repeated_readings_in_motion_are_found(share, least):
+    record, bad = slow_record(sound=False, kind='repeated', share=share, length=1)
+    mask = without_faults(record).pieces[0].mask
+    # in a rest nobody can tell
+    assert np.mean(~mask[bad]) > least and np.mean(bad[~mask]) > 0.95
+
+
+def test_the_model_of_lossy_readings_is_that_of_sound_ones():
+    truth, settings = slow_record()[0], pi.Settings(thresholds=8, order=(2, 2))
+    good = pi.identify(truth, settings)
+    span = abs(good.model.scaling.Y)
+    for kind, length in (('zero', 1), ('full scale', 7)):
+        record, _ = slow_record(sound=False, kind=kind, share=0.1, length=length)
+        found = pi.identify(record, settings)
+        apart = found.model.simulate(PLAYED.v) - good.model.simulate(PLAYED.v)
+        assert np.sqrt(np.mean(apart**2)) < NOISE
+        assert found.model.delay.samples == good.model.delay.samples
+        assert found.stroke == pytest.approx(good.stroke, rel=1e-3)
+        assert found.headline.percent == pytest.approx(good.headline.percent, rel=0.1)
+        assert found.noise_floor == pytest.approx(good.noise_floor, rel=0.15)
+        # and the same errors, wherever they are printed
+        sound, spoilt = (pi.free_run(found.model, r).errors for r in (truth, record))
+        assert spoilt.percent == pytest.approx(sound.percent, abs=100 * NOISE / span)
+        assert spoilt.n < sound.n
+        checked = pi.identify(truth, settings, validation=[record])
+        rows = [row for row in checked.errors if row.data == 'validation']
+        assert max(row.percent for row in rows) < 1.2 * good.headline.percent
+
+
+def test_steps_rests_and_stops_are_no_lost_readings():
+    rng = np.random.default_rng(3)
+    # steps and pulses of the stage, late by ten samples and ringing
+    v = np.repeat(rng.uniform(0, 10, 400), rng.integers(3, 500, 400))
+    late = np.concatenate([np.full(10, v[0]), v[:-10]])
+    pole = 0.97 * np.exp(0.4j)
+    ringing = lfilter([abs(1 - pole) ** 2], np.poly([pole, pole.conjugate()]).real, late - v[0])
+    for y in (late, ringing):
+        assert cleaned(7.5e-6 * y + 2e-9 * rng.standard_normal(v.size), v)[1] == {}
+    # a sensor that was set to another zero within the record
+    assert cleaned(Y + np.where(T < 4.0, 0.0, 5e-6), V)[1] == {}
+    # quantised rests at zero, and a stage that is at its end
+    q = 75e-6 / 2**12
+    rests = np.clip(np.round((Y - 20e-6) / q) * q, 0.0, 40e-6)
+    assert cleaned(rests, V)[1] == {}

@@ -126,12 +126,11 @@ def test_the_voltage_goes_on_where_the_displacement_alone_is_bad(unmeasure, tmp_
     y[hole] = unmeasure(y[hole])
     record = Record.from_arrays(v, y, sample_rate=20e3)
     run = free_run(STAGE.model, record)
-    assert len(run.pieces) == 2
     # by a straight line of voltage, this hole costs 0.3 %
     assert run.errors.percent < 0.005
     (joined,) = bridged(run.record)
     assert_array_equal(joined.piece.v, v)
-    assert not joined.sound[hole][1:].any()
+    assert not joined.sound[hole][1:].any() and run.errors.n < 29_100
     assert joined.gaps == 0
     # a file of any format keeps it
     for name in ('kept.csv', 'kept.npz', 'kept.mat', 'kept.mcap', 'kept.db3', 'kept'):

@@ -74,40 +74,6 @@ def test_shipped_programs_have_no_fault(stage, name):
     assert faults(read.v, read.y, 0.7 * y + 0.3 * lfilter([0.02], [1, -0.98], y))[0] == {}
 
 
-@pytest.mark.parametrize('share', [0.002, 0.02])
-def test_missed_samples(truth, share):
-    v, y, read = truth
-    rng = np.random.default_rng(3)
-    missed = rng.random(y.size) < share
-    k = np.arange(y.size)
-    k[missed] = 0
-    z = read[np.maximum.accumulate(k)]
-    named, found = faults(v, z, y)
-    assert 'missed_samples' in named
-    assert 'timing_jitter' not in named
-    # a sample is only known to be missed where the position moves fast; those named are right
-    (bad,) = found.bad
-    assert np.mean(missed[bad]) > 0.95
-
-
-def test_a_sensor_that_hangs_while_the_drive_moves(truth):
-    v, y, read = truth
-    z, hung = read.copy(), np.zeros(y.size, dtype=bool)
-    rng = np.random.default_rng(3)
-    for start in (15_000, 31_000, 47_000, 52_000, 55_000, 66_000):
-        stop = start + int(rng.integers(1200, 3000))
-        z[start:stop], hung[start + 1 : stop] = z[start], True
-    # a model of a wrong size is no excuse
-    named, found = faults(v, z, 0.98 * y)
-    assert 'stretches in which the sensor hangs' in named['missed_samples'].action
-    assert not np.any(found.out[0] & ~hung)
-    # in a rest nobody can tell
-    assert np.mean(found.out[0][hung & (np.abs(np.gradient(v)) > 1e-5)]) > 0.9
-    # however many there are: nothing can be learnt from them
-    (left_out,) = found.left_out(0.001)
-    assert np.all(left_out[found.out[0]])
-
-
 def test_steps_in_coarse_readings_with_a_sensor_that_hangs_are_still_known():
     code = np.repeat(np.arange(200), 50)
     code[3000:7000] = code[3000]
@@ -193,9 +159,6 @@ def test_clipping(truth):
     end = read.max() - 2e-6
     named, found = faults(v, np.minimum(read, end), y)
     assert set(named) == {'clipping'}
-    # no model can fill in what was not read
-    np.testing.assert_array_equal(found.out[0], found.bad[0])
-    np.testing.assert_array_equal(found.left_out(0.0)[0], found.bad[0])
     assert found.bad[0].sum() > 0.5 * np.sum(read > end)
 
 

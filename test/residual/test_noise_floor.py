@@ -10,6 +10,7 @@ from piezo_ident.residual import residual_noise_floor, ResidualPart
 from piezo_ident.residual.stretches import block_means, find_repeats, stretches_of
 import pytest
 from residual_data import creep, misfit, part_of, pink, RATE, V
+from scipy.signal import lfilter
 
 
 def test_stretches_of_a_program():
@@ -92,11 +93,23 @@ def test_rests_serve_where_nothing_repeats():
 def test_floor_is_unknown_without_either():
     rng = np.random.default_rng(5)
     v = np.cumsum(rng.standard_normal(5000))
-    part = ResidualPart('r', Piece(v, v, RATE), rng.standard_normal(5000))
+    slow = lfilter([0.5], [1.0, -0.5], rng.standard_normal(5000))
+    part = ResidualPart('r', Piece(v, v, RATE), slow)
     floor = residual_noise_floor([part], stretches_of(part))
     assert floor.rms is None
     assert floor.at(4) is None
     assert floor.source.startswith('floor unknown')
+
+
+def test_a_residual_that_is_white_throughout_is_noise():
+    rng = np.random.default_rng(5)
+    v, e = np.cumsum(rng.standard_normal(5000)), 2e-9 * rng.standard_normal(5000)
+    sound = rng.random(5000) > 0.1
+    e[~sound] = 1.0
+    part = ResidualPart('r', Piece(v, v, RATE), e, sound)
+    floor = residual_noise_floor([part], stretches_of(part))
+    assert floor.rms == pytest.approx(2e-9, rel=0.05)
+    assert floor.at(4) == pytest.approx(1e-9, rel=0.05)
 
 
 def test_bridged_samples_are_cut_out():

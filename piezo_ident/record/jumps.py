@@ -1,0 +1,212 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Readings that jump away from a signal and come back: what a sound signal does not do.
+
+Jumps are steps far beyond those around them.  They cut the signal into parts.  Of all ways to keep
+parts and leave out others, the cheapest is taken: a sample left out costs 1, a jump kept costs
+`JUMP`, or nothing where the voltage explains it, and parts that go on where the one before them
+ended cost nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers, interpolated, Mask, true_runs
+from piezo_ident.common.kernel import kernel
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
+
+#: a jump is this share of the stroke at least, and so many of the steps usual around it; so many
+#: of them are looked at on either side (taste: white noise reaches 6.7 of its median step)
+LEAST, FAR, AROUND = 2e-3, 8.0, 16
+WIDTH = 2 * AROUND + 1
+#: and so many codes of a converter, of which noise turns two
+CODES = 3.0
+#: a quantile that holds where half of all steps are jumps, and the median over it, of normal ones
+QUANTILE = 0.3, 1.75
+#: second over first differences where steps have no memory; white noise has 1.73, a sine of four
+#: samples a period 1.41; the share of the stroke from which steps are large
+ROUGH, LARGE = 1.3, 0.1
+#: samples that a jump costs: up to nine wild readings in a row, which two jumps enclose, are left
+#: out whether they are alike or not
+JUMP = 5
+#: share of a signal beyond which a stretch between two jumps is no excursion
+LONGEST = 0.1
+#: parts behind one that may go on where it ended
+PARTS = 256
+#: the voltage explains a jump where it asks for this share of it in one step, and a stage answers
+#: by up to so many times the path that is asked for; it answers a step for so many samples
+STEPS, OVER, RINGS = 0.3, 1.5, 30
+
+
+def least_step(y: Array) -> float:
+    """Return the least step from one reading [m] to the next, infinite where none moves."""
+    steps = np.abs(np.diff(y))
+    return float(steps[steps > 0.0].min(initial=np.inf))
+
+
+def wild_readings(
+    error: Array, stroke: float, step: float = np.inf, measured: Array | None = None
+) -> Mask:
+    """
+    Return which readings are wild, of measured minus predicted displacement [m].
+
+    What the voltage does is in the prediction; `step` is the `least_step` of what was `measured`.
+    A jump of the error is a wild reading only where the measured displacement makes it: a goal out
+    of reach jumps as well.
+
+    >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
+    >>> wild_readings(error, stroke=10.0).nonzero()[0]
+    array([9])
+    >>> bool(wild_readings(error, stroke=10.0, measured=np.zeros(19)).any())
+    False
+    """
+    floor = max(LEAST * stroke, CODES * step if np.isfinite(step) else 0.0)
+    wild = Jumps.of(error, np.zeros(error.size), floor, stroke).left_out()
+    if measured is None or not wild.any():
+        return wild
+    off, jumped = (np.abs(x - interpolated(x, wild)) for x in (error, measured))
+    for a, b in true_runs(wild):
+        wild[a:b] = jumped[a:b].max() > 0.5 * off[a:b].max()
+    return wild
+
+
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """
+    A signal y cut at its jumps.
+
+    `start` is the first sample of each part and the end of the signal; `height` the step into each
+    part, `least` how large it must be to be a jump, and `cost` what it costs to keep it.  `path`
+    is what the voltage asked for from the first sample on [m]; `delay` samples before are counted.
+    """
+
+    y: Array
+    start: Integers
+    height: Array
+    least: Array
+    cost: Integers
+    path: Array
+    delay: int
+
+    @classmethod
+    def of(cls, y: Array, asked: Array, floor: float, stroke: float, delay: int = 0) -> Jumps:
+        """Cut a signal; `asked` is what the voltage asks for, from each sample to the next [m]."""
+        step = np.diff(y, prepend=y[:1])
+        size = np.abs(step)
+        # two readings cannot tell which of them is wild
+        at = np.flatnonzero(size > floor) if y.size > 2 else np.empty(0, np.int64)
+        usual, bend = (_usual(np.abs(d), at) for d in (step[1:], np.diff(step[1:])))
+        answered = maximum_filter1d(asked, 2 * RINGS + 1)[at] >= STEPS * usual
+        # large steps without any memory that nobody asked for are no motion, nor a usual step
+        wild = (usual > LARGE * stroke) & (bend > ROUGH * usual) & ~answered
+        usual = np.where(wild, 0.0, usual)
+        far = size[at] > FAR * usual
+        at = at[far]
+        least = np.maximum(floor, FAR * usual[far])
+        # a step of the voltage is answered by a rise of several samples, and ringing
+        rings = np.where(asked > FAR * uniform_filter1d(asked, 2 * AROUND + 1), asked, 0.0)
+        behind = np.maximum(_before(asked, delay), _before(rings, RINGS))[at]
+        explained = behind >= STEPS * size[at]
+        return cls(
+            y=y,
+            start=np.concatenate([[0], at, [y.size]]).astype(np.int64),
+            height=np.concatenate([[0.0], step[at]]),
+            least=np.concatenate([[0.0], least]),
+            cost=np.concatenate([[0], np.where(explained, 0, JUMP)]).astype(np.int64),
+            path=np.cumsum(asked),
+            delay=delay,
+        )
+
+    def left_out(self) -> Mask:
+        """Return which samples are left out."""
+        out = np.zeros(self.y.size, dtype=bool)
+        if self.height.size == 1:
+            return out
+        before = _cheapest(
+            self.y, self.start, self.least, self.cost, self.path, self.delay, OVER, PARTS
+        )
+        kept = []
+        # the last entry is the end of the signal
+        part = int(before[-1])
+        while part >= 0:
+            kept.append(part)
+            part = int(before[part])
+        out[:] = True
+        for part in kept:
+            out[self.start[part] : self.start[part + 1]] = False
+        for a, b in self._excursions(kept[::-1]):
+            out[a:b] = True
+        return out
+
+    def _excursions(self, kept: Sequence[int]) -> list[tuple[int, int]]:
+        """Return long stretches between two jumps that the voltage cannot have made."""
+        paid = [i for i, j in zip(kept[1:], kept[:-1], strict=True) if i == j + 1 and self.cost[i]]
+        found: list[tuple[int, int]] = []
+        for i, j in itertools.pairwise(paid):
+            a, b = int(self.start[i]), int(self.start[j])
+            # what follows an excursion is none
+            if b - a > LONGEST * self.y.size or (found and a <= found[-1][1]):
+                continue
+            way = OVER * float(self.path[b] - self.path[max(0, a - 1 - self.delay)])
+            least = float(max(self.least[i], self.least[j]))
+            height = min(abs(self.height[i]), abs(self.height[j]))
+            comes_back = abs(self.y[b] - self.y[a - 1]) <= least + way
+            if self.height[i] * self.height[j] < 0.0 and comes_back and height > 2.0 * way + least:
+                found.append((a, b))
+        return found
+
+
+def _usual(x: Array, at: Integers) -> Array:
+    """Return the median of normally distributed x >= 0 around places, whatever half of it is."""
+    if not at.size:
+        return np.empty(0)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(x, AROUND, 'symmetric'), WIDTH)
+    place = int(QUANTILE[0] * WIDTH)
+    return np.asarray(
+        QUANTILE[1] * np.partition(around[np.minimum(at - 1, x.size - 1)], place)[:, place]
+    )
+
+
+def _before(x: Array, most: int) -> Array:
+    """Return the largest x of each sample and up to `most` before it."""
+    return np.asarray(maximum_filter1d(x, most + 1, origin=most // 2, mode='nearest'))
+
+
+@kernel
+def _cheapest(
+    y: Array,
+    start: Integers,
+    least: Array,
+    cost: Integers,
+    path: Array,
+    delay: int,
+    over: float,
+    most: int,
+) -> Integers:
+    # before[j]: the part kept before part j, -1 for none; the last entry stands for the end
+    n = start.size - 1
+    total, before = np.empty(n + 1), np.full(n + 1, -1)
+    for j in range(n + 1):
+        total[j] = start[j]
+        for i in range(max(0, j - most), j):
+            gap = start[j] - start[i + 1]
+            if total[i] + gap >= total[j]:
+                continue
+            if j < n and i == j - 1:
+                now = total[i] + cost[j]
+            else:
+                now = total[i] + gap
+                if j < n:
+                    last = start[i + 1] - 1
+                    way = over * (path[start[j]] - path[max(0, last - delay)])
+                    if abs(y[start[j]] - y[last]) > max(least[i + 1], least[j]) + way:
+                        continue
+            if now < total[j]:
+                total[j], before[j] = now, i
+    return before
