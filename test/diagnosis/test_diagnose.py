@@ -307,7 +307,9 @@ def test_what_a_wider_hysteresis_imitates_may_hide_in_it():
     assert (result.verdict, result.effects) == ('none', ()), result.sentence
     assert result.group.names[0] == 'noncongruent_minor_loops'
     assert 'may hide in the base model' in result.sentence
-    assert result.errors_of_laws[result.law] < 0.5 * result.errors_of_laws['plays']
+    # H stays as it was given, though a wider law would err less
+    assert result.law == ''
+    assert min(result.errors_of_laws.values()) < 0.5 * result.errors_of_laws['plays']
     assert max(unseen_errors(result, unseen)) < 0.1
 
 
