@@ -24,17 +24,20 @@ demo: .venv/.demo
 	.venv/bin/python examples/demo.py --out demo_report
 
 # the tests that mostly compute, those of node processes with mypy beside them, then what judges
-# seconds, one after the other; a file stays in one process, the slowest file starts first
+# seconds, one after the other; a file stays in one process, the slowest file starts first; what
+# another program's burst made fail is asked once more, alone
 PARALLEL := --dist loadfile --no-loadscope-reorder
+AGAIN := --last-failed --last-failed-no-failures none
 
 test: .venv/.test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pytest -n 2 $(PARALLEL) -m 'not timed' --ignore=test/nodes $(PYTEST_ARGS)
 	.venv/bin/mypy & types=$$!; \
-	.venv/bin/pytest -n 3 $(PARALLEL) -m 'not timed' test/nodes $(PYTEST_ARGS); rc=$$?; \
+	.venv/bin/pytest -n 3 $(PARALLEL) -m 'not timed' test/nodes $(PYTEST_ARGS) || \
+	.venv/bin/pytest $(AGAIN) -m 'not timed' test/nodes $(PYTEST_ARGS); rc=$$?; \
 	wait $$types && exit $$rc
-	.venv/bin/pytest -m timed $(PYTEST_ARGS)
+	.venv/bin/pytest -m timed $(PYTEST_ARGS) || .venv/bin/pytest $(AGAIN) -m timed $(PYTEST_ARGS)
 
 lint: .venv/.test
 	.venv/bin/ruff check .
