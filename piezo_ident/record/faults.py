@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
 from piezo_ident.record.channels import role_of
-from piezo_ident.record.jumps import AROUND, CODES, FAR, JUMP, Jumps, LEAST, RINGS
+from piezo_ident.record.jumps import AROUND, CODES, FAR, JUMP, Jumps, LEAST, least_jump, RINGS
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.record import Fault, Piece, Record
 
@@ -135,7 +135,7 @@ def _wild(piece: Piece, stroke: float, span: float) -> Mask:
             asked = np.maximum(asked, steps * (stroke / width))
     asked[0] = 0.0
     delay = int(np.clip(round(DELAY * piece.sample_rate), 2, RINGS))
-    wild = Jumps.of(y, asked, _floor(y, stroke), stroke, delay).left_out()
+    wild = Jumps.of(y, asked, least_jump(y, stroke), stroke, delay).left_out()
     return _marked(y, wild, LEAST * stroke)
 
 
@@ -160,13 +160,6 @@ def _marked(y: Array, bad: Mask, least: float) -> Mask:
     return marked
 
 
-def _floor(y: Array, stroke: float) -> float:
-    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
-    steps = np.abs(np.diff(y[:_CHUNK]))
-    moved = steps[steps > 0.0]
-    return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
-
-
 def _held(piece: Piece, stroke: float, span: float) -> Mask:
     """
     Return where the reading stays at one value, and jumps at the end to make up for it.
@@ -186,7 +179,7 @@ def _held(piece: Piece, stroke: float, span: float) -> Mask:
     ]
     if not runs or not span:
         return found
-    floor = _floor(y, stroke)
+    floor = least_jump(y, stroke)
     ends = float(y.min()), float(y.max())
     trembles = _trembles(y)
     for a, b in runs:

@@ -25,6 +25,8 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 #: of them are looked at on either side (taste: white noise reaches 6.7 of its median step)
 LEAST, FAR, AROUND = 2e-3, 8.0, 16
 WIDTH = 2 * AROUND + 1
+#: samples looked at together, so that temporaries stay small beside a long record
+_CHUNK = 1 << 20
 #: and so many codes of a converter, of which noise turns two
 CODES = 3.0
 #: a quantile that holds where half of all steps are jumps, and the median over it, of normal ones
@@ -50,6 +52,13 @@ def least_step(y: Array) -> float:
     return float(steps[steps > 0.0].min(initial=np.inf))
 
 
+def least_jump(y: Array, stroke: float) -> float:
+    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
+    steps = np.abs(np.diff(y[:_CHUNK]))
+    moved = steps[steps > 0.0]
+    return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
+
+
 def wild_readings(
     error: Array, stroke: float, step: float = np.inf, measured: Array | None = None
 ) -> Mask:
@@ -66,7 +75,7 @@ def wild_readings(
     >>> bool(wild_readings(error, stroke=10.0, measured=np.zeros(19)).any())
     False
     """
-    floor = max(LEAST * stroke, CODES * step if np.isfinite(step) else 0.0)
+    floor = max(least_jump(error, stroke), CODES * step if np.isfinite(step) else 0.0)
     wild = Jumps.of(error, np.zeros(error.size), floor, stroke).left_out()
     if measured is None or not wild.any():
         return wild
