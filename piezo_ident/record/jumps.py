@@ -31,8 +31,8 @@ _CHUNK = 1 << 20
 CODES = 3.0
 #: a quantile that holds where half of all steps are jumps, and the median over it, of normal ones
 QUANTILE = 0.3, 1.75
-#: second over first differences where steps have no memory; white noise has 1.73, a sine of four
-#: samples a period 1.41; the share of the stroke from which steps are large
+#: rms of second over that of first differences where steps have no memory; white noise has 1.73, a
+#: sine of five samples a period 1.18; the share of the stroke from which steps are large
 ROUGH, LARGE = 1.3, 0.1
 #: samples that a jump costs: up to nine wild readings in a row, which two jumps enclose, are left
 #: out whether they are alike or not
@@ -110,16 +110,18 @@ class Jumps:
         size = np.abs(step)
         # two readings cannot tell which of them is wild
         at = np.flatnonzero(size > floor) if y.size > 2 else np.empty(0, np.int64)
-        usual, bend = (_usual(np.abs(d), at) for d in (step[1:], np.diff(step[1:])))
+        usual = _usual(size[1:], at)
+        # mean squares of first and second differences
+        run, bend = (uniform_filter1d(d * d, WIDTH)[at] for d in (step, np.diff(step, append=0.0)))
         answered = maximum_filter1d(asked, 2 * RINGS + 1)[at] >= STEPS * usual
         # large steps without any memory that nobody asked for are no motion, nor a usual step
-        wild = (usual > LARGE * stroke) & (bend > ROUGH * usual) & ~answered
+        wild = (usual > LARGE * stroke) & (bend > ROUGH**2 * run) & ~answered
         usual = np.where(wild, 0.0, usual)
         far = size[at] > FAR * usual
         at = at[far]
         least = np.maximum(floor, FAR * usual[far])
         # a step of the voltage is answered by a rise of several samples, and ringing
-        rings = np.where(asked > FAR * uniform_filter1d(asked, 2 * AROUND + 1), asked, 0.0)
+        rings = np.where(asked > FAR * uniform_filter1d(asked, WIDTH), asked, 0.0)
         behind = np.maximum(_before(asked, delay), _before(rings, RINGS))[at]
         explained = behind >= STEPS * size[at]
         return cls(
