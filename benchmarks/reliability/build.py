@@ -93,7 +93,7 @@ DDS finds its peers on other hosts by multicast. Where that is kept to the local
 before any node starts. The file makes socket buffers of 4 MiB, so that a burst of blocks survives
 a busy receiver (raise `net.core.rmem_max` and `net.core.wmem_max` to as much), and has a lost
 packet asked for again within 10 ms instead of seconds. That matters: a topic keeps its last
-hundred blocks, half a second in real time, and what is asked for later is gone. A link that is
+thousand blocks, five seconds in real time, and what is asked for later is gone. A link that is
 down for longer, or a machine too busy to answer, therefore loses samples, every listener says how
 many, and no model is made of what is left where too much is missing. A call of a service may go
 unanswered on such a link too: ~/run then ends with that reason.
