@@ -15,7 +15,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 SOURCED := $(or $(ROS_DISTRO),$(AMENT_PREFIX_PATH))
 MADE := .venv/.made$(if $(SOURCED),-sourced)
 
-.PHONY: attack docs netns soak
+.PHONY: any-record attack docs netns soak
 .PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash limits mirror study table-one clean distclean
 .DELETE_ON_ERROR:
@@ -106,6 +106,10 @@ SECONDS ?= 7200
 soak: .venv/.test
 	$(RUN_STUDY)/soak.py --seconds $(SECONDS)
 	$(RUN_STUDY)/build.py
+
+# unlabelled records of seventeen kinds beside four simple peers, about an hour
+any-record: .venv/.demo
+	.venv/bin/python benchmarks/any_record.py docs/any_record.md
 
 # Table I of the paper with a third row: about a minute
 table-one: .venv/.demo

@@ -32,6 +32,8 @@ ROOMS = (
     'effects',
     'model',
     'residual',
+    'fitting',
+    'selection',
     'identification',
     'axes',
     'diagnosis',

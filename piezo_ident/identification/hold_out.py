@@ -28,6 +28,8 @@ MIN_FIT = 100
 MOVES = 0.02
 #: runs that are fitted, those of the widest range first
 MOST_RUNS = 8
+#: stretches that are held out of a run together (taste)
+STRETCHES = 4
 #: places that are tried, from the end backwards
 PLACES = 20
 #: share of the range, and of the energy of every band, that has to stay in the rest
@@ -36,11 +38,14 @@ STAYS = 0.65
 TRAVELS = 0.3
 
 
-def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], list[Mask]]:
+def fitted_parts(
+    runs: Sequence[Run], settings: Settings, spread: bool = False
+) -> tuple[list[Run], list[Mask]]:
     """
     Return the runs that are fitted, the widest first, and which samples of each.
 
-    With `hold_out` set it is always the end that is held out.  IdentificationError when what is
+    With `hold_out` set it is always the end that is held out.  `spread`: else a few stretches all
+    over each run.  IdentificationError when what is
     left of the widest to fit or to judge by is too short.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
@@ -53,9 +58,14 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
         if n_held >= MIN_HELD and n_fit >= MIN_FIT:
-            start = n_fit if settings.hold_out else held_out_place(run.u, rate, n_held)
             fitted = np.ones(piece.n, dtype=bool)
-            fitted[start : start + n_held] = False
+            if spread and not settings.hold_out:
+                # the end is among them: stretches in between would not show what drifts
+                for stop in np.linspace(0, piece.n, STRETCHES + 1).astype(int)[1:]:
+                    fitted[stop - n_held // STRETCHES : stop] = False
+            else:
+                start = n_fit if settings.hold_out else held_out_place(run.u, rate, n_held)
+                fitted[start : start + n_held] = False
             enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
             if enough or not chosen:
                 chosen.append(run)

@@ -18,11 +18,12 @@ from piezo_ident.identification.step2_dynamics import OrderTable
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
 from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import StartLike
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
-Memories = dict[tuple[str, float], Array]
+Memories = Mapping[tuple[str, float], StartLike]
 #: called with the name of the step and the share of it that is done; raises `Cancelled` to stop
 Progress = Callable[[str, float], None]
 
@@ -333,7 +334,7 @@ class Identification(Showable):
     settings : Settings
     records : tuple of Record
         What was fitted, then what was given for validation.
-    memories : mapping of (str, float) to ndarray
+    memories : mapping of (str, float) to ndarray or Start
         Fitted play outputs at the start of a piece, by record name and start time.
 
     Examples
@@ -359,7 +360,7 @@ class Identification(Showable):
     not_identified: tuple[tuple[str, str], ...]
     settings: Settings
     records: tuple[Record, ...] = ()
-    memories: Mapping[tuple[str, float], Array] = field(default_factory=dict)
+    memories: Memories = field(default_factory=dict)
 
     def error(self, data: str) -> float:
         """

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
@@ -330,7 +329,7 @@ class PieceRun:
 def piece_runs(
     model: StageModel,
     records: Iterable[Record] | Record,
-    memories: Mapping[tuple[str, float], ArrayLike] | None = None,
+    memories: Mapping[tuple[str, float], StartLike] | None = None,
 ) -> list[PieceRun]:
     """
     Run a model over all pieces that have its sampling rate.

@@ -1,0 +1,201 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The fit: Gauss-Newton on the free-run error, inside bounds, with priors and damping.
+
+Damping after D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
+doi:10.1137/0111030.  What is linear, the weights of H above all, is found exactly within a step:
+the step is a bounded least-squares problem of all values together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.fitting.equations import bounded_step, Equations
+from piezo_ident.fitting.stage import Stage
+from piezo_ident.fitting.stretch import Stretch
+
+#: first damping, a share of the energy of each column, its factors, and where a step is given up
+DAMPING, WORSE, BETTER, LEAST, MOST = 1e-4, 5.0, 0.1, 1e-9, 1e6
+#: the fit ends when a step lowers the loss, or promises to, by less than this share
+SLOW = 1e-4
+#: independent observations in a block: neighbouring residuals are alike (taste)
+OBSERVATIONS = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """
+    Result of a fit.
+
+    Attributes
+    ----------
+    stage : Stage
+    loss : float
+        Sum of squares of what is left of the samples that count, normalised.
+    equations : Equations
+        Linearised at the result, block by block.
+    iterations : int
+        Steps that were taken.
+    """
+
+    stage: Stage
+    loss: float
+    equations: Equations
+    iterations: int
+
+    @property
+    def n(self) -> int:
+        """Samples that count."""
+        return int(self.equations.rows.sum())
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of what is left, normalised."""
+        return float(np.sqrt(self.loss / max(self.n, 1)))
+
+    def prior_weight(self) -> Array:
+        """Return the weight of the prior on the diagonal of the equations, shape (p,)."""
+        return _prior_weight(self.stage, self.loss, self.equations.rows)
+
+    def held_out(self, sets: Integers) -> Array:
+        """Return the sum of squares of each block, predicted from the other sets; shape (n_b,)."""
+        values = self.stage.values
+        lower, upper = self.stage.bounds
+        return self.equations.held_out(sets, self.prior_weight(), lower - values, upper - values)
+
+    def covariance(self) -> Array:
+        """Return the covariance of the values, for white residuals; zero on a bound."""
+        free = self.stage.free(self.stage.values)
+        A = self.equations.A.sum(axis=0)[np.ix_(free, free)]
+        size = np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
+        whole = np.zeros((free.size, free.size))
+        inverse = np.linalg.pinv(A / np.outer(size, size), 1e-12, hermitian=True)
+        whole[np.ix_(free, free)] = inverse / np.outer(size, size) * self.loss / max(self.n, 1)
+        return whole
+
+
+def residuals(stage: Stage, stretches: Sequence[Stretch]) -> list[Array]:
+    """Return measured minus predicted of each stretch, shapes (n,)."""
+    return [s.x - stage.signals(s)[2] - stage.added(s) for s in stretches]
+
+
+def fit(
+    stage: Stage,
+    stretches: Sequence[Stretch],
+    *,
+    iterations: int = 15,
+    tick: Callable[[], None] = lambda: None,
+) -> Fit:
+    """
+    Fit all numbers of a stage.
+
+    Parameters
+    ----------
+    stage : Stage
+        Where the fit starts; orders, delay, thresholds and time constants stay.
+    stretches : sequence of Stretch
+    iterations : int, optional
+        Most steps.
+    tick : callable, optional
+        Called once a step; may raise to stop the work.
+
+    Raises
+    ------
+    IdentificationError
+        When no sample counts, or the start predicts no finite number.
+    """
+    if not any(s.use.any() for s in stretches):
+        raise IdentificationError('no sample is left to fit; hold out less')
+    signals = [stage.signals(s) for s in stretches]
+    loss = _loss(stage, stretches, signals)
+    if not np.isfinite(loss):
+        raise IdentificationError(
+            'the first guess of the free-run fit diverges on these data; are all values of a '
+            'plausible size?'
+        )
+    equations, damping, done = _linearised(stage, stretches, signals), DAMPING, 0
+    for _ in range(iterations):
+        tick()
+        A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
+        values, (lower, upper) = stage.values, stage.bounds
+        (middle, _), weight = stage.prior, _prior_weight(stage, loss, equations.rows)
+        pulled = b + weight * (middle - values)
+        better, promised = None, np.inf
+        while damping < MOST:
+            step = bounded_step(A, pulled, weight, lower - values, upper - values, damping)
+            promised = float(step @ (2.0 * b - A @ step))
+            if promised < SLOW * loss:
+                break
+            try:
+                trial = stage.moved(values + step)
+            except ModelError:
+                damping *= WORSE
+                continue
+            new_signals = [trial.signals(s) for s in stretches]
+            new = _loss(trial, stretches, new_signals)
+            if new < loss:
+                better = trial
+                break
+            damping *= WORSE
+        if better is None:
+            break
+        fall, stage, loss, signals = 1.0 - new / loss, better, new, new_signals
+        damping = max(damping * BETTER, LEAST)
+        equations, done = _linearised(stage, stretches, signals), done + 1
+        if fall < SLOW or loss == 0.0:
+            break
+    return Fit(stage, loss, equations, done)
+
+
+def _prior_weight(stage: Stage, loss: float, rows: Integers) -> Array:
+    observations = max(1.0, OBSERVATIONS * float(np.count_nonzero(rows)))
+    return loss / observations / stage.prior[1] ** 2
+
+
+def _loss(
+    stage: Stage, stretches: Sequence[Stretch], signals: Sequence[tuple[Array, Array, Array]]
+) -> float:
+    with np.errstate(over='ignore', invalid='ignore'):
+        return float(
+            sum(
+                np.sum((s.x - y - stage.added(s))[s.use] ** 2)
+                for s, (_, _, y) in zip(stretches, signals, strict=True)
+            )
+        )
+
+
+def _linearised(
+    stage: Stage, stretches: Sequence[Stretch], signals: Sequence[tuple[Array, Array, Array]]
+) -> Equations:
+    """Return the normal equations of all stretches, block by block."""
+    count = 1 + max(int(s.block[-1]) for s in stretches)
+    p = stage.values.size
+    A, b, total = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros(count)
+    rows = np.zeros(count, dtype=np.int64)
+    for s, own in zip(stretches, signals, strict=True):
+        at = np.flatnonzero(s.use)
+        if not at.size:
+            continue
+        e = (s.x - own[2] - stage.added(s))[at]
+        M = np.zeros((p, at.size))
+        for j, column in enumerate(stage.columns(s, own)):
+            if column is not None:
+                M[j] = column[at]
+        alive = np.flatnonzero(M.any(axis=1))
+        M, block = M[alive], s.block[at]
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [at.size]])
+        for start, stop in itertools.pairwise(edges):
+            k, part = block[start], M[:, start:stop]
+            A[np.ix_([k], alive, alive)] += part @ part.T
+            b[k, alive] += part @ e[start:stop]
+            total[k] += e[start:stop] @ e[start:stop]
+            rows[k] += stop - start
+    return Equations(A, b, total, rows)

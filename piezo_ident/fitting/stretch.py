@@ -1,0 +1,70 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A uniformly sampled motion as a fit sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers, Mask
+from scipy.signal import lfilter
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """
+    A motion, which samples count, and in which block each is.
+
+    Attributes
+    ----------
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement.  All of the voltage is simulated.
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    block : ndarray of int, shape (n,)
+        Number of the block of each sample; it never falls along a stretch.
+    rate : float
+        [Hz]
+    number : int
+        Place of the start among those of all stretches.
+    record : int
+        Place of the offset among those of all records.
+    """
+
+    u: Array
+    x: Array
+    use: Mask
+    block: Integers
+    rate: float
+    number: int = 0
+    record: int = 0
+
+    @property
+    def times(self) -> Array:
+        """Time since the first sample [s], shape (n,)."""
+        return np.arange(self.u.size) / self.rate
+
+    def lagged(self, h: Array, tau: float) -> Array:
+        """Return a signal behind 1 / (1 + tau p), from rest; tau in seconds, shape (n,)."""
+        share = -np.expm1(-1.0 / (self.rate * tau))
+        return np.asarray(h[0] + lfilter([share], [1.0, share - 1.0], h - h[0]))
+
+    def with_use(self, use: Mask) -> Stretch:
+        """Return the same motion with other samples that count."""
+        return replace(self, use=use)
+
+
+def delayed(x: Array, samples: int) -> Array:
+    """
+    Return a signal some samples later, preceded by its own first value; shape (n,).
+
+    Examples
+    --------
+    >>> delayed(np.array([1.0, 2.0, 3.0]), 1).tolist()
+    [1.0, 1.0, 2.0]
+    """
+    if samples == 0:
+        return x
+    return np.concatenate([np.full(min(samples, x.size), x[0]), x[: -samples or None]])

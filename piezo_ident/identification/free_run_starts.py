@@ -1,0 +1,272 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The starts of a free-run fit: a straight line, H alone, G first, H first.
+
+Each is fitted by the one fit and compared by the one comparison, so the result predicts what was
+held out no worse than the best of them.  G comes from least squares at several orders and delays
+(ARX), once from the voltage and once from what H makes of it; the fit then moves H, G and the
+memory at the start together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers, true_runs
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.fitting.free_run import Fit, fit
+from piezo_ident.fitting.stage import Stage
+from piezo_ident.fitting.stretch import delayed, Stretch
+from piezo_ident.identification.step1_delay import MAX_DELAY
+from piezo_ident.identification.step2_dynamics import factor_of, stabilised
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.selection.comparison import best_of, Candidate, candidate
+from scipy.signal import butter, sosfilt
+
+#: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
+ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
+#: steps of a rough fit and of a finished one
+FEW, MANY = 6, 15
+#: share of the sampling rate above which least squares looks for modes that slow motion hides
+HIGH_PASS = 0.01
+#: delays of least one-step loss that are tried in free run, of each order
+NEAR = 3
+#: delays of H alone that are tried first [samples]
+COARSE = (0, 1, 2, 4, 8, 16, 32, 64)
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What a user has fixed: a delay [samples], an order (na, nb), the largest order."""
+
+    delay: int | None = None
+    order: tuple[int, int] | None = None
+    largest: int = 15
+
+    @property
+    def is_free(self) -> bool:
+        """Whether neither delay nor order are fixed."""
+        return self.delay is None and self.order is None
+
+    @property
+    def delays(self) -> Sequence[int]:
+        """Delays that may be tried."""
+        return range(MAX_DELAY) if self.delay is None else (self.delay,)
+
+    def orders(self, of: Sequence[int]) -> list[tuple[int, int]]:
+        """Return the orders of a list that may be tried."""
+        if self.order is not None:
+            return [self.order]
+        return [(n, n + 1) for n in of if n <= self.largest]
+
+
+def linear_starts(
+    inputs: Sequence[Array], stretches: Sequence[Stretch], allowed: Allowed, of: Sequence[int]
+) -> dict[tuple[int, int], tuple[int, Dynamics]]:
+    """
+    Return for each order the delay and the G of least squares that err least in free run.
+
+    Parameters
+    ----------
+    inputs : sequence of ndarray
+        What goes into G on each stretch, normalised.
+    stretches : sequence of Stretch
+    allowed : Allowed
+    of : sequence of int
+        Orders na.
+    """
+    orders = allowed.orders(of)
+    rate = stretches[0].rate
+    sos = butter(2, HIGH_PASS * rate, 'highpass', fs=rate, output='sos')
+    found: dict[tuple[int, int], tuple[float, int, Dynamics]] = {}
+    for filtered in (False, True):
+        pairs = [(w - w[0], s.x - s.x[0]) for w, s in zip(inputs, stretches, strict=True)]
+        if filtered:
+            pairs = [(sosfilt(sos, w), sosfilt(sos, x)) for w, x in pairs]
+        for (na, nb), d, G in _by_least_squares(pairs, stretches, orders, allowed.delays):
+            left = _free_run_left(G, d, inputs, stretches)
+            if (na, nb) not in found or left < found[na, nb][0]:
+                found[na, nb] = left, d, G
+    return {order: (d, G) for order, (_, d, G) in found.items()}
+
+
+def _by_least_squares(
+    pairs: Sequence[tuple[Array, Array]],
+    stretches: Sequence[Stretch],
+    orders: Sequence[tuple[int, int]],
+    delays: Sequence[int],
+) -> list[tuple[tuple[int, int], int, Dynamics]]:
+    parts = [
+        (w[a:b], x[a:b])
+        for (w, x), s in zip(pairs, stretches, strict=True)
+        for a, b in true_runs(s.use)
+    ]
+    found = []
+    # long orders leave short parts out, so each length has a factor of its own
+    for most in sorted({na for na, _ in orders}, reverse=True):
+        lags = max(nb for na, nb in orders if na <= most) + max(delays) + 1
+        long = [(w, x) for w, x in parts if w.size > 3 * (most + lags)]
+        if long:
+            break
+    else:
+        return []
+    factor = factor_of(long, most, lags)
+    for na, nb in orders:
+        if na > most:
+            continue
+        # the loss of one step names the delay; in free run its neighbours may do better
+        losses = {d: factor.fit(na, nb, d)[1] for d in delays}
+        for d in sorted(losses, key=lambda d: losses[d])[:NEAR]:
+            G = stabilised(factor.dynamics(na, nb, d))
+            if G.is_stable and 0.0 < G.gain < np.inf:
+                found.append(((na, nb), d, G))
+    return found
+
+
+def _free_run_left(
+    G: Dynamics, d: int, inputs: Sequence[Array], stretches: Sequence[Stretch]
+) -> float:
+    """Return the sum of squares that G leaves, an offset taken out of each stretch."""
+    left = 0.0
+    for w, s in zip(inputs, stretches, strict=True):
+        e = (s.x - filter_arx(G.a, G.b, delayed(w, d)))[s.use]
+        if e.size:
+            left += float(np.sum((e - e.mean()) ** 2))
+    return left
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """
+    The search for H, G and the delay on a few stretches.
+
+    Attributes
+    ----------
+    stretches : sequence of Stretch
+    sets, kinds : ndarray of int, or None for `kinds`
+        Of each block, for the comparison.
+    law : HysteresisLaw
+        Plays alone.
+    guesses : ndarray, shape (stretches, PARTS)
+        First guess of the memory of each start.
+    records : int
+    allowed : Allowed
+    tick : callable
+        Called between the steps; may raise to stop the work.
+    """
+
+    stretches: Sequence[Stretch]
+    sets: Integers
+    kinds: Integers | None
+    law: HysteresisLaw
+    guesses: Array
+    records: int
+    allowed: Allowed
+    tick: Callable[[], None]
+
+    def best(self) -> tuple[Candidate, tuple[Candidate, ...]]:
+        """Return the best candidate, and all."""
+        alone = self._hysteresis_alone()
+        found = [self._candidate('hysteresis', alone)]
+        rough = [alone, *self._rough([s.u for s in self.stretches], None)]
+        rough += self._rough(self._inputs(alone.stage), alone.stage)
+        first = min(rough, key=lambda one: one.loss)
+        starts = linear_starts(self._inputs(first.stage), self.stretches, self.allowed, ORDERS)
+        for (na, _), (d, G) in starts.items():
+            one = self._fit(_with_dynamics(first.stage, d, G), MANY)
+            found.append(self._candidate(f'order {na}', one))
+        found += self._later(best_of(found))
+        return best_of(found), tuple(found)
+
+    def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
+        """Return the candidate with creep, with a wider law of H, and with both."""
+        stage = best.fit.stage
+        wide = HysteresisLaw('preisach', stage.law.thresholds, stage.law.span)
+        found = []
+        for name, trial in (
+            ('creep', stage.with_creep(taus)),
+            ('preisach', stage.with_law(wide)),
+            ('preisach, creep', stage.with_law(wide).with_creep(taus)),
+        ):
+            effects = int(trial.taus.size > 0)
+            found.append(self._candidate(f'{best.name}, {name}', self._fit(trial, MANY), effects))
+        return found
+
+    def _later(self, best: Candidate) -> list[Candidate]:
+        """Return what a first coefficient of B less and a sample of delay more leave, in turn."""
+        found: list[Candidate] = []
+        one = best
+        while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:
+            stage = one.fit.stage
+            shorter = Dynamics(stage.dynamics.a, stage.dynamics.b[1:])
+            if not shorter.gain > 0.0:
+                break
+            start = _with_dynamics(stage, stage.delay + 1, shorter)
+            one = self._candidate(f'{best.name}, later', self._fit(start, FEW))
+            if best_of([best, one]) is best:
+                break
+            found.append(one)
+        return found
+
+    def _candidate(self, name: str, one: Fit, effects: int = 0) -> Candidate:
+        return candidate(name, one, self.sets, self.kinds, effects)
+
+    def _fit(self, stage: Stage, steps: int) -> Fit:
+        return fit(stage, self.stretches, iterations=steps, tick=self.tick)
+
+    def _inputs(self, stage: Stage) -> list[Array]:
+        return [stage.hysteresis(s.u, stage.memory(s)) for s in self.stretches]
+
+    def _hysteresis_alone(self) -> Fit:
+        """Return H and a pure delay, the best of a few and then of their neighbours."""
+        tried: dict[int, Fit] = {}
+
+        def at(d: int) -> Fit:
+            if d not in tried:
+                start = min(tried.values(), key=lambda one: one.loss).stage if tried else None
+                if start is None:
+                    start = Stage.linear(self.law, Dynamics.unit(), d, self.guesses, self.records)
+                tried[d] = self._fit(replace(start, delay=d), FEW)
+            return tried[d]
+
+        if self.allowed.delay is not None:
+            return at(self.allowed.delay)
+        for i, d in enumerate(COARSE):
+            at(d)
+            if i > 1 and tried[COARSE[i]].loss > tried[COARSE[i - 1]].loss:
+                break
+        while True:
+            best = min(tried, key=lambda d: tried[d].loss)
+            below = max((d for d in tried if d < best), default=best)
+            above = min((d for d in tried if d > best), default=best)
+            gaps = [(a + b) // 2 for a, b in ((below, best), (best, above)) if b - a > 1]
+            if not gaps:
+                return tried[best]
+            for d in gaps:
+                at(d)
+
+    def _rough(self, inputs: Sequence[Array], stage: Stage | None) -> list[Fit]:
+        found = []
+        for d, G in linear_starts(inputs, self.stretches, self.allowed, ROUGH).values():
+            start = (
+                Stage.linear(self.law, G, d, self.guesses, self.records)
+                if stage is None
+                else _with_dynamics(stage, d, G)
+            )
+            try:
+                found.append(self._fit(start, FEW))
+            except IdentificationError:
+                # a start that diverges is none
+                continue
+        return found
+
+
+def _with_dynamics(stage: Stage, d: int, G: Dynamics) -> Stage:
+    """Return a stage with another G, whose gain goes into H."""
+    gain = G.gain
+    return replace(stage, dynamics=G.normalised(), delay=d, coefficients=stage.coefficients * gain)

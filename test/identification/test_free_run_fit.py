@@ -1,0 +1,131 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One record without labels: what it excites is found, what it does not is named."""
+
+from dataclasses import replace
+
+import numpy as np
+from paper_stage import PAPER
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.free_run_fit import fit_free_run
+from piezo_ident.identification.prepare import prepare
+from piezo_ident.identification.results import Settings, silent
+from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.record.record import Piece, Record, records_of
+import pytest
+
+pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
+
+FS = 5000.0
+# a lightly damped mode at 700 Hz, as a small stage at 5 kHz has it
+POLE = np.exp(2 * np.pi * 700 / FS * (-0.03 + 1j * np.sqrt(1 - 0.03**2)))
+G = Dynamics(np.real(np.poly([POLE, np.conj(POLE)]))[1:], [0.3, 0.3]).normalised()
+STAGE = replace(PAPER, sample_rate=FS, dynamics=G, delay=Delay(2))
+
+
+def record_of(v, noise=1e-5, memory=None, name='record'):
+    v = np.asarray(v, dtype=float)
+    y = STAGE.stream(memory).process(v)
+    y = y + noise * 75e-6 * np.random.default_rng(0).standard_normal(v.size)
+    return Record((Piece(v, y, FS),), name)
+
+
+def identify(records, settings=None):
+    data = prepare(records_of(records, 'identify'))
+    return fit_free_run(data.runs, data.rate, data.scaling, settings or Settings(), silent)
+
+
+def sine(seconds, f=2.0, phase=0.0):
+    return 5 - 5 * np.cos(2 * np.pi * f * np.arange(int(seconds * FS)) / FS + phase)
+
+
+def has_the_mode(model):
+    return any(abs(mode.frequency / 700 - 1) < 0.03 for mode in model.dynamics.modes(FS))
+
+
+def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
+    steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 1500)
+    result = identify(record_of(np.concatenate([steps, sine(2.0)])))
+    assert result.delay.samples == 2
+    assert result.not_identified == ()
+    G = result.model.dynamics
+    assert has_the_mode(result.model)
+    assert G.is_stable
+    assert G.gain == pytest.approx(1.0, abs=1e-9)
+    unseen = sine(2.0, 3.0)
+    y = STAGE.simulate(unseen)
+    assert np.std(result.model.simulate(unseen) - y) < 1e-3 * np.ptp(y)
+
+
+def test_a_slow_record_is_predicted_at_other_slow_motion():
+    result = identify(record_of(sine(2.0)))
+    unseen = sine(2.0, 1.0)
+    y = STAGE.simulate(unseen)
+    assert np.std(result.model.simulate(unseen) - y) < 2e-3 * np.ptp(y)
+
+
+def test_memory_of_a_start_in_the_middle_is_found():
+    rng = np.random.default_rng(4)
+    r = STAGE.hysteresis.thresholds
+    truth = 0.5 - np.cumsum(np.diff(np.concatenate([[0.0], r])) * rng.uniform(0, 1, r.size))
+    record = record_of(sine(2.0, phase=np.pi / 2), memory=truth)
+    result = identify(record)
+    (piece,) = record.pieces
+    [start] = result.memories.values()
+    left = piece.y - result.model.predict_piece(piece, start)
+    without = piece.y - result.model.predict_piece(piece)
+    early = slice(0, 1000)
+    assert np.std(left[early]) < 0.2 * np.std(without[early])
+    u0, thresholds = 0.5, result.model.hysteresis.thresholds
+    assert np.all(start <= u0 + 1e-3)
+    assert np.all(start >= u0 - thresholds - 1e-3)
+
+
+def test_a_given_delay_is_taken_and_too_little_is_refused():
+    assert identify(record_of(sine(1.0)), Settings(delay=4)).delay.samples == 4
+    flat = record_of(np.concatenate([np.zeros(1000), sine(0.2)]))
+    with pytest.raises(IdentificationError, match='--hold-out'):
+        identify(flat, Settings(hold_out=0.21))
+
+
+def test_several_records_are_all_fitted_each_with_its_own_zero():
+    def record(name, v, zero, seed):
+        y = STAGE.stream(None).process(v) + zero
+        y += 1e-5 * 75e-6 * np.random.default_rng(seed).standard_normal(v.size)
+        return Record((Piece(v, y, FS),), name)
+
+    one = record('one', sine(3.0), 0.0, 0)
+    two = record('two', 0.8 * sine(3.0, f=5.0), 4e-6, 1)
+    result = identify([one, two])
+    # the zero that moved is no error of the model
+    zero = result.offsets['two', 0.0]
+    assert zero == pytest.approx(4e-6, rel=0.02)
+    assert any('two: its zero of displacement' in said for said in result.warnings)
+
+
+def test_the_only_chirp_is_not_held_out():
+    t = np.arange(int(1.0 * FS)) / FS
+    drive = (
+        0.3 * np.sin(2.0 * np.pi * (20.0 * t + 590.0 * t**2)) * np.minimum(1.0, 20.0 * (1.0 - t))
+    )
+    v = np.concatenate([sine(4.0), drive])
+    # the chirp swings a little below 0 V
+    with pytest.warns(UserWarning, match='extrapolation'):
+        y = STAGE.simulate(v)
+    result = identify(Record((Piece(v, y, FS),), 'ends in a chirp'))
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    assert 'held out' in result.warnings[0]
+
+
+def test_what_chooses_lies_within_what_is_fitted():
+    # the last quarter alone goes beyond 6 V
+    steps = np.repeat([0.0, 2, 0, 3, 0, 4, 0], 1500)
+    v = np.concatenate([steps, 0.6 * sine(4.0), sine(1.0), 0.5 * sine(1.5)])
+    rng = np.random.default_rng(0)
+    y = STAGE.simulate(v) + 2e-8 * rng.standard_normal(v.size)
+    result = identify(Record((Piece(v, y, FS),), 'grows'))
+    assert result.not_identified == ()
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    unseen = STAGE.simulate(v := sine(2.0, 3.0))
+    assert np.std(result.model.simulate(v) - unseen) < 2e-3 * np.ptp(unseen)

@@ -1,0 +1,123 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""H, G and the delay from any motion, on modes in continuous time behind a held voltage."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+from piezo_ident.fitting.stage import PARTS
+from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.identification.free_run_starts import Allowed, Search
+from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.selection.motion_kinds import interleaved
+import pytest
+from scipy import signal
+
+FS, OVER = 20_000.0, 8
+#: natural frequency [Hz], damping, share of the static gain: an antiresonance lies between them
+MODES = ((900.0, 0.01, 0.8), (2300.0, 0.015, 0.2))
+DELAY = 2.375
+
+
+def stage(w):
+    """Return the answer of the modes to a held signal, a fraction of a sample late."""
+    held = np.concatenate([np.zeros(round(DELAY * OVER)), np.repeat(w, OVER)])[: w.size * OVER]
+    x = np.zeros(held.size)
+    for f, zeta, share in MODES:
+        s = 2.0 * np.pi * f
+        system = ([share * s * s], [1.0, 2.0 * zeta * s, s * s])
+        b, a, _ = signal.cont2discrete(system, 1.0 / FS / OVER, 'zoh')
+        x += signal.lfilter(np.ravel(b), a, held)
+    return x[::OVER]
+
+
+def truth(f):
+    s = 2j * np.pi * f
+    modal = sum(
+        share * (2 * np.pi * f0) ** 2 / (s * s + 4 * np.pi * zeta * f0 * s + (2 * np.pi * f0) ** 2)
+        for f0, zeta, share in MODES
+    )
+    # the hold is half a sample late
+    return modal * np.exp(-s * (DELAY + 0.5) / FS) * np.sinc(f / FS)
+
+
+def chirp(seconds, top):
+    t = np.arange(int(seconds * FS)) / FS
+    return 0.05 * signal.chirp(t, 10.0, seconds, top) * np.minimum(1.0, 50.0 * t)
+
+
+def steps():
+    return np.repeat(np.arange(24) % 2 * 0.1, 1500).astype(float)
+
+
+def noise():
+    white = np.random.default_rng(2).standard_normal(30_000)
+    return 0.02 * signal.sosfilt(signal.butter(4, 4000.0, fs=FS, output='sos'), white)
+
+
+def found_in(w, x, **allowed):
+    """Return the stage that the search finds for one motion."""
+    span = np.ptp(w)
+    block = np.arange(w.size) * 25 // w.size
+    whole = np.ones(w.size, dtype=bool)
+    stretch = Stretch((w - w.min()) / span, x / span, whole, block, FS)
+    law = HysteresisLaw('plays', np.arange(1, 10) / 10.0)
+    guess = np.full((1, PARTS), 0.5)
+    search = Search(
+        [stretch], interleaved(25), None, law, guess, 1, Allowed(**allowed), lambda: None
+    )
+    best, _ = search.best()
+    return best.fit.stage
+
+
+@pytest.mark.parametrize('drive', [lambda: chirp(1.2, 4000.0), steps, noise])
+def test_modes_antiresonance_and_delay_come_out_of_any_broad_motion(drive):
+    w = drive()
+    x = stage(w) + 2e-5 * np.random.default_rng(1).standard_normal(w.size)
+    found = found_in(w, x)
+    G = found.dynamics
+    # poles near half the sampling rate stand for the part of a sample of the delay
+    modes = sorted(m.frequency for m in G.modes(FS) if m.damping < 0.1 and m.frequency < 5000.0)
+    assert_allclose(modes, [f for f, *_ in MODES], rtol=3e-3)
+    f = np.array([50.0, 300.0, 700.0, 1200.0, 1500.0, 2000.0])
+    late = np.exp(-2j * np.pi * f * found.delay / FS)
+    expected = truth(f)
+    # a ring of some samples tells the phase of the whole
+    assert_allclose(G.response(f, FS) * late, expected, atol=0.02 * abs(expected).max())
+    assert G.a.size <= 6
+
+
+def test_a_chirp_in_much_noise_shows_both_modes():
+    w = chirp(1.2, 4000.0)
+    x = stage(w)
+    x += 0.2 * np.std(x) * np.random.default_rng(3).standard_normal(x.size)
+    modes = [m for m in found_in(w, x).dynamics.modes(FS) if m.damping < 0.1]
+    modes = [m for m in modes if m.frequency < 5000.0]
+    assert [round(mode.frequency / 10.0) for mode in modes] == [90, 230]
+    assert_allclose([mode.damping for mode in modes], [0.01, 0.015], rtol=0.05)
+
+
+def test_one_slow_sine_shows_no_mode_but_what_its_start_rings():
+    w = 0.5 * np.sin(2.0 * np.pi * 40.0 * np.arange(20_000) / FS)
+    x = stage(w) + 1e-3 * np.random.default_rng(1).standard_normal(w.size)
+    for mode in found_in(w, x).dynamics.modes(FS):
+        if mode.damping < 0.1:
+            assert min(abs(mode.frequency / f - 1.0) for f, *_ in MODES) < 0.01
+
+
+def test_a_mode_that_rings_longer_than_a_block_is_kept():
+    rings = np.exp(2.0 * np.pi * 60.0 / FS * (-0.006 + 1j * np.sqrt(1.0 - 0.006**2)))
+    a = np.real(np.poly([rings, np.conj(rings)]))
+    w = noise()
+    x = signal.lfilter([a.sum()], a, w)
+    found = found_in(w, x + 2e-5 * np.random.default_rng(1).standard_normal(w.size))
+    low = (m for m in found.dynamics.modes(FS) if m.damping < 0.1 and m.frequency < 5000.0)
+    [mode] = low
+    assert mode.frequency == pytest.approx(60.0, rel=1e-3)
+
+
+def test_a_given_delay_and_order_are_kept():
+    w = chirp(0.3, 4000.0)
+    found = found_in(w, stage(w), delay=2, order=(4, 6))
+    assert found.delay == 2
+    assert (found.dynamics.a.size, found.dynamics.b.size) in [(4, 6), (0, 1)]

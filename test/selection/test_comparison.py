@@ -1,0 +1,57 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One comparison: least error, effects that pay, fewest parameters among those alike."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, EFFECT
+from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
+
+
+def one(name, error, size=3, effects=0):
+    fit = SimpleNamespace(stage=SimpleNamespace(size=size))
+    return Candidate(name, fit, error, error, effects)
+
+
+def test_the_least_error_wins_and_of_those_alike_the_smaller():
+    assert best_of([one('a', 1.0), one('b', 0.5)]).name == 'b'
+    assert best_of([one('large', 1.0, 9), one('small', 0.99 * ALIKE, 2)]).name == 'small'
+    assert best_of([one('large', 1.0, 9), one('small', 1.01 * ALIKE, 2)]).name == 'large'
+
+
+def test_an_effect_has_to_take_most_of_what_is_left():
+    plain = one('plain', 1.0)
+    assert best_of([plain, one('creep', 1.05 * EFFECT, 5, 1)]).name == 'plain'
+    assert best_of([plain, one('creep', 0.9 * EFFECT / ALIKE, 5, 1)]).name == 'creep'
+
+
+def test_both_ways_of_holding_out_count():
+    both = Candidate('x', None, 4.0, 1.0)
+    assert both.error == 2.0
+
+
+def stretch(parts, rate=1000.0):
+    u = np.concatenate(parts)
+    block = np.arange(u.size) // 100
+    return Stretch(u, u, np.ones(u.size, dtype=bool), block, rate)
+
+
+def test_blocks_of_one_motion_are_one_kind_and_edges_are_none():
+    t = np.arange(100) / 1000.0
+    levels = [(0.2, 0.02, 10), (0.5, 0.1, 20), (0.5, 0.02, 40), (0.8, 0.2, 10), (0.4, 0.05, 30)]
+    parts = [m + a * np.sin(2 * np.pi * f * t) for m, a, f in levels * 8]
+    s = stretch(parts)
+    kinds = motion_kinds([s], 40)
+    if kinds is not None:
+        for first in range(5):
+            assert len(set(kinds[first::5])) == 1
+        assert (kinds == -1).any()
+
+
+def test_one_kind_of_motion_has_no_kinds():
+    t = np.arange(4000) / 1000.0
+    assert motion_kinds([stretch([np.sin(2 * np.pi * 50.0 * t[:400])])], 4) is None
+    assert set(interleaved(10)) == set(range(5))
