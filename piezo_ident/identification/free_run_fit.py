@@ -40,7 +40,7 @@ from piezo_ident.identification.step3_hysteresis import (
     HysteresisFit,
 )
 from piezo_ident.identification.three_steps import within
-from piezo_ident.identification.warnings import warn_of_range, warn_of_zeros
+from piezo_ident.identification.warnings import only_jumps, warn_of_range, warn_of_zeros
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.model.stream import Start
@@ -385,19 +385,9 @@ def _missing(fits: _Fits, delay: DelayResult, band: float) -> dict[str, str]:
             'no order of G errs clearly less on held-out motion than the hysteresis and a pure '
             f'delay (the voltage moves up to {band:.3g} Hz); add steps or noise'
         )
-    if all(_only_jumps(run.u) for run in fits.chosen):
-        missing['hysteresis'] = (
-            'the voltage only jumps between levels, and what lies between them was never seen; '
-            'add a slow triangle'
-        )
+    if reason := only_jumps(fits.chosen):
+        missing['hysteresis'] = reason
     return missing
-
-
-def _only_jumps(u: Array) -> bool:
-    """Return whether a voltage rests, but for a few samples that make nearly all of its way."""
-    du = np.abs(np.diff(u))
-    large = du > 0.02 * float(np.ptp(u))
-    return bool(du[large].sum() > 0.9 * du.sum() and np.mean(large) < 0.1)
 
 
 def _named(run: Run, fitted: Mask) -> str:

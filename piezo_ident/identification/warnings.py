@@ -234,14 +234,21 @@ def reasons_of(
             f'{given if settings.order else largest} {GAIN:.0%} less on held-out fast motion than '
             'the hysteresis and a pure delay; add steps or noise'
         )
+    if reason := only_jumps(excerpts):
+        missing['hysteresis'] = reason
+    return missing
+
+
+def only_jumps(excerpts: Sequence[Excerpt]) -> str:
+    """Say that the voltage leaves too much out between its levels, where it does."""
     gap = min(map(_jumped_over, (e.u for e in excerpts)))
     # on as many levels as the paper has plays, a staircase is a triangle
-    if PAPER_COUNT * gap > 1.0:
-        missing['hysteresis'] = (
-            f'the voltage only jumps between levels, and {gap:.0%} of its range lies between two '
-            'neighbours and was never seen; add a slow triangle'
-        )
-    return missing
+    if PAPER_COUNT * gap <= 1.0:
+        return ''
+    return (
+        f'the voltage only jumps between levels, and {gap:.0%} of its range lies between two '
+        'neighbours and was never seen; add a slow triangle'
+    )
 
 
 def _no_fast_motion(excerpts: Sequence[Excerpt], rate: float) -> str:
