@@ -69,7 +69,8 @@ def wild_readings(
     A jump of the error is a wild reading only where the measured displacement makes it: a goal out
     of reach jumps as well.
 
-    >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
+    >>> error = np.resize([0.0, 1e-3], 19)
+    >>> error[9] = 1.0
     >>> wild_readings(error, stroke=10.0).nonzero()[0]
     array([9])
     >>> bool(wild_readings(error, stroke=10.0, measured=np.zeros(19)).any())

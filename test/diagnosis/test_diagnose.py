@@ -693,7 +693,7 @@ def test_one_pass_over_the_range_names_nothing():
     result = diagnose(model, once, FEW)
     assert not result.effects
     assert result.verdict in ('none', 'unexplained')
-    assert 'nothing that is fitted could be tested' in result.sentence
+    assert 'no effect could be tested' in result.sentence
     assert 'no candidate' not in result.sentence
 
 
