@@ -187,7 +187,14 @@ def test_an_identifier_that_is_killed_in_a_run(lab):
     at_nine_volts(lab)
     lab.handle('identifier').die()
     new = lab.restart(lab.handle('identifier'))
-    lab.wait(lambda: float(lab.diagnostics('identifier').get('captured', 0)) > 0.5, 'a capture')
+    # what the killed one said last is still there
+    told = len(lab.diagnoses('identifier'))
+
+    def captures():
+        words = lab.diagnoses('identifier')[told:]
+        return words and float(words[-1].get('captured', 0)) > 0.5
+
+    lab.wait(captures, 'a capture of the new one')
     kept = float(lab.diagnostics('identifier')['captured'])
     # nobody stops the program, and it is not started again over itself
     seen = run(lab, PROGRAM)
