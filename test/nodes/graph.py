@@ -69,6 +69,8 @@ class Graph(Observer):
         self.folder = Path(tempfile.mkdtemp(prefix='piezo_ident_graph_'))
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
         os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))
+        # shared memory is locked by a node that is killed, and takes three times the processor
+        os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
         self.environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(self.domain),
