@@ -149,7 +149,7 @@ def scores(models: dict[str, LoopModel], records: Sequence[PeriodicRecord]) -> d
         for record in members:
             powers.append(np.mean(record.y[-1] ** 2, axis=0))
             try:
-                errors.append(np.mean(models[group].error(record) ** 2, axis=0))
+                errors.append(np.nanmean(models[group].error(record) ** 2, axis=0))
             except ModelError:
                 errors.append(np.full(record.y.shape[2], np.inf))
         found[group] = Score(

@@ -32,7 +32,9 @@ from piezo_ident.axes.model_text import AxesModel
 from piezo_ident.axes.paths import axis_errors, AxisError, Path, paths_of
 from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
 from piezo_ident.common.errors import DataError
+from piezo_ident.identification.prepare import fault_lines
 from piezo_ident.record.channels import Axes
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 
 #: most periods of one segment
@@ -57,19 +59,23 @@ class Periods:
         That mean [V].
     inputs, outputs : tuple of str
         Their columns.
+    faults : tuple of str
+        What was wrong with the records, and what was done about it.
     """
 
     records: tuple[PeriodicRecord, ...]
     v0: NDArray[np.float64]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    faults: tuple[str, ...] = ()
 
 
 def periods_of(records: Sequence[Record]) -> Periods:
     """
     Find the periodic segments of some records of one stage.
 
-    Of three periods or more the first is left out: the stage settles in it.
+    Of three periods or more the first is left out: the stage settles in it.  Readings that cannot
+    be the stage's are left out of all that is made of them (`piezo_ident.record.faults`).
 
     Raises
     ------
@@ -77,6 +83,7 @@ def periods_of(records: Sequence[Record]) -> Periods:
         When there is none, or they differ in length.
     """
     found, resting = [], set[str]()
+    records = [without_faults(record) for record in records]
     every = Axes.of_records(records)
     pieces = [piece for record in records for piece in record]
     for axes, piece in zip(every, pieces, strict=True):
@@ -117,6 +124,7 @@ def periods_of(records: Sequence[Record]) -> Periods:
         v0,
         every[0].input_names,
         every[0].output_names,
+        tuple(fault_lines(records)),
     )
 
 
@@ -199,8 +207,8 @@ class AxesIdentification:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Records that do not repeat, couplings missed, and what the name leaves open."""
-        told = [str(p) for p in self.periodicity if p.suspicious]
+        """Faults, records that do not repeat, couplings missed, what the name leaves open."""
+        told = [*self.periods.faults, *(str(p) for p in self.periodicity if p.suspicious)]
         told += [
             f'the model does not tell what {p.input} moves of {p.output}: it errs by '
             f'{p.error:.2g} % of the motion of {p.output} there'

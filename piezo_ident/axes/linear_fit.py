@@ -81,12 +81,11 @@ def linear_error(model: Modal, record: PeriodicRecord) -> float:
     Quadratic mean over the outputs.
     """
     samples = record.u.shape[1]
-    u, y = (np.fft.rfft(x[-1], axis=0) for x in (record.u, record.y))
+    u = np.fft.rfft(record.u[-1], axis=0)
     response = model.response(np.exp(2j * np.pi * np.arange(len(u)) / samples))
     answer = np.einsum('kpm,km->kp', response, u)
-    answer[0] = 0
-    error = np.fft.irfft(y - answer, samples, axis=0)
-    shares = np.mean(error**2, axis=0) / np.mean(record.y[-1] ** 2, axis=0)
+    error = record.error(np.fft.irfft(answer, samples, axis=0))
+    shares = np.nanmean(error**2, axis=0) / np.mean(record.y[-1] ** 2, axis=0)
     return 100 * float(np.sqrt(np.mean(shares)))
 
 

@@ -257,7 +257,8 @@ class _Problem:
         for record, weight in zip(records, weights, strict=True):
             u, y = record.mean_u, record.mean_y
             before = u[len(u) - self.warm_up :]
-            scale = weight / np.sqrt(np.mean(y**2, axis=0))
+            # a phase at which no period was read does not count
+            scale = record.sound.any(axis=0) * (weight / np.sqrt(np.mean(y**2, axis=0)))
             self.targets.append((np.concatenate([before, u]), y, scale))
 
     def cost(self, model: LoopModel, pool: ThreadPoolExecutor) -> float:
@@ -277,8 +278,8 @@ class _Problem:
     def _error(self, model: LoopModel, target: Target) -> tuple[NDArray[np.float64], Passage]:
         u, y, scale = target
         run = model.run(u)
-        answer = run.y[self.warm_up :]
-        return (answer - answer.mean(axis=0) - y) * scale, run
+        left = run.y[self.warm_up :] - y
+        return (left - np.average(left, axis=0, weights=scale)) * scale, run
 
     def normal_equations(
         self, model: LoopModel, pool: ThreadPoolExecutor
@@ -298,8 +299,9 @@ class _Problem:
             hessian, gradient = np.zeros((total, total)), np.zeros(total)
             for o in range(outputs):
                 columns = np.hstack([inner[:, o], plain])
-                columns -= columns.mean(axis=0)
-                columns *= np.float32(scale[o])
+                weight = scale[:, o].astype(np.float32)
+                columns -= weight @ columns / weight.sum()
+                columns *= weight[:, None]
                 at = np.r_[:many, many + o * each : many + (o + 1) * each]
                 hessian[np.ix_(at, at)] += columns.T @ columns
                 gradient[at] += columns.T @ error[:, o].astype(np.float32)

@@ -129,8 +129,8 @@ class LoopModel:
         return LoopStream(self)
 
     def error(self, record: PeriodicRecord) -> NDArray[np.float64]:
-        """Return y - yhat over the last period of a record, in steady state and free run."""
-        return np.asarray(record.y[-1] - self.simulate(record.u[-1]))
+        """Return the error over the last period of a record, in steady state and free run."""
+        return record.error(self.simulate(record.u[-1]))
 
 
 class LoopStream:

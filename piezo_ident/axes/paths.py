@@ -99,7 +99,7 @@ def axis_errors(
     model: LoopModel, records: Sequence[PeriodicRecord], outputs: Sequence[str]
 ) -> tuple[AxisError, ...]:
     """Judge every output alone on records held out, quadratic mean over the records."""
-    errors = np.array([np.mean(model.error(r) ** 2, axis=0) for r in records])
+    errors = np.array([np.nanmean(model.error(r) ** 2, axis=0) for r in records])
     powers, strokes = (np.array([f(r.y[-1], axis=0) for r in records]) for f in (np.var, np.ptp))
     shares = 100 * np.sqrt(np.mean(errors / powers, axis=0))
     of_stroke = 100 * np.sqrt(np.mean(errors / strokes**2, axis=0))
@@ -128,9 +128,11 @@ def paths_of(
     own = [[i for i, name in enumerate(inputs) if name[1:] == o[1:]] for o in outputs]
     rows = []
     for record in records:
-        y = record.y[-1]
+        answer = model.simulate(record.u[-1])
+        # what was lost is taken for what the model says
+        error = np.nan_to_num(record.error(answer))
         alone = np.column_stack([_answer(model, record, part)[:, o] for o, part in enumerate(own)])
-        signals = np.hstack([record.u[-1], model.error(record), y - alone])
+        signals = np.hstack([record.u[-1], error, answer + error - alone])
         signals /= np.sqrt(np.mean(record.u**2))
         rows.append(np.fft.rfft(signals, axis=0)[lines])
     u, answers = np.split(np.array(rows), [len(inputs)], axis=2)

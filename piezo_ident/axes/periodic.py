@@ -12,16 +12,20 @@ reported, with the frequencies where it lies, and counts less in a fit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import interpolated, Mask
 from piezo_ident.common.errors import DataError
 
 #: a record that differs between periods by so many times the median of all is suspicious
 SUSPICIOUS = 3.0
 #: bands in which the difference is compared
 BANDS = 16
+#: times that what stands in for lost readings and the mean of a period are found from one another;
+#: each leaves the share that is lost of what is wrong
+TURNS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +43,13 @@ class PeriodicRecord:
         Samples a second.
     u, y : ndarray, shape (periods, samples, inputs) and (periods, samples, outputs)
         Voltages and displacements.  The mean of y is taken off: steady state does not tell where
-        a stage stands.
+        a stage stands.  Where y is given as NaN, a reading was lost: those of other periods stand
+        in for it, or a straight line.
+
+    Attributes
+    ----------
+    sound : ndarray of bool, shape of y
+        False where a reading was lost, which no error counts.
     """
 
     name: str
@@ -47,6 +57,7 @@ class PeriodicRecord:
     rate: float
     u: NDArray[np.float64]
     y: NDArray[np.float64]
+    sound: Mask = field(init=False)
 
     def __post_init__(self) -> None:
         u, y = (np.array(x, dtype=float) for x in (self.u, self.y))
@@ -55,13 +66,17 @@ class PeriodicRecord:
                 f'{self.name}: u {u.shape} and y {y.shape} are not (periods, samples, channels) '
                 'of equal periods and samples'
             )
+        sound = ~np.isnan(y)
+        if not sound.any(axis=1).all():
+            raise DataError(f'{self.name}: a channel of y holds no reading of a whole period')
+        y = _about_mean(y, sound)
         for label, x in (('u', u), ('y', y)):
             if not np.isfinite(x).all():
                 raise DataError(f'{self.name}: {label} holds values that are not finite')
             if not np.ptp(x, axis=1).all():
                 raise DataError(f'{self.name}: a channel of {label} rests throughout a period')
-        object.__setattr__(self, 'u', u)
-        object.__setattr__(self, 'y', y - y.mean(axis=1, keepdims=True))
+        for name, value in {'u': u, 'y': y, 'sound': sound}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def mean_u(self) -> NDArray[np.float64]:
@@ -73,12 +88,34 @@ class PeriodicRecord:
         """Displacements averaged over the periods, shape (samples, outputs)."""
         return np.asarray(self.y.mean(axis=0))
 
+    def error(self, answer: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return y - answer over the last period without its mean; NaN where y was lost."""
+        e = np.where(self.sound[-1], self.y[-1] - answer, np.nan)
+        return np.asarray(e - np.nanmean(e, axis=0))
+
     @property
     def noise(self) -> NDArray[np.float64]:
         """Noise of one period, estimated from what differs between the last two."""
         if len(self.y) < 2:
             raise DataError(f'{self.name}: noise needs two periods, not {len(self.y)}')
-        return np.asarray((self.y[-1] - self.y[-2]) / np.sqrt(2))
+        both = self.sound[-1] & self.sound[-2]
+        # as much as if no reading had been lost
+        share = np.maximum(both.mean(axis=0), 1 / len(both))
+        return np.asarray(np.where(both, self.y[-1] - self.y[-2], 0.0) / np.sqrt(2 * share))
+
+
+def _about_mean(y: NDArray[np.float64], sound: Mask) -> NDArray[np.float64]:
+    """Return displacements without the mean of each period, what was lost filled in."""
+    if sound.all():
+        return np.asarray(y - y.mean(axis=1, keepdims=True))
+    count = sound.sum(axis=0)
+    y = y - np.nanmean(y, axis=1, keepdims=True)
+    for _ in range(TURNS):
+        usual = np.where(sound, y, 0.0).sum(axis=0) / np.maximum(count, 1)
+        lines = [interpolated(x, n == 0) for x, n in zip(usual.T, count.T, strict=True)]
+        y = np.where(sound, y, np.column_stack(lines))
+        y -= y.mean(axis=1, keepdims=True)
+    return y
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ class Axes:
     inputs : ndarray, shape (n, m)
         Command voltages [V].
     outputs : ndarray, shape (n, p)
-        Displacements [m].
+        Displacements [m], NaN where a reading was left out.
     input_names, output_names : tuple of str
         The columns that they are: the first axis before the others, these by their names.
     sample_rate : float
@@ -147,16 +147,18 @@ class Axes:
         Raises
         ------
         DataError
-            Where a voltage or a displacement is not known.
+            Where a voltage is not known, or nothing of a displacement.
         """
-        columns = {'v': piece.v, 'y': piece.y, **piece.channels}
+        columns = {'v': piece.v, 'y': piece.measured, **piece.channels}
         names = {
             role: (role, *sorted(k for k in piece.channels if role_of(k) == role)) for role in 'vy'
         }
         for name in (*names['v'], *names['y']):
-            if not np.isfinite(columns[name]).all():
-                what = _QUANTITIES[name[0]]
-                raise DataError(f'{name}: the {what} is not known at every sample; record it too')
+            known = np.isfinite(columns[name])
+            if name in names['y'] and not known.any():
+                raise DataError(f'{name}: the displacement is not known; record it too')
+            if name in names['v'] and not known.all():
+                raise DataError(f'{name}: the voltage is not known at every sample; record it too')
         inputs, outputs = (
             frozen_array(np.column_stack([columns[k] for k in names[role]])) for role in 'vy'
         )

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+import functools
 
 import numpy as np
 from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
@@ -62,12 +63,48 @@ def without_faults(record: Record) -> Record:
     Return a record whose masks leave out the readings that cannot be the stage's.
 
     A straight line stands in for them, and for the voltage of a row that was lost as a whole.
-    What is found is counted in the faults of the record.  Where nothing is, or where the masks
-    were decided before, the same record is returned.
+    Of the displacement of another axis, a channel, they become NaN.  What is found is counted in
+    the faults of the record.  Where nothing is, or where the masks were decided before, the same
+    record is returned.
     """
-    span = float(np.ptp(record.voltage_range))
-    if record.stroke == 0.0 or any(piece.sound is not None for piece in record):
+    if any(piece.sound is not None for piece in record):
         return record
+    names = dict.fromkeys(k for piece in record for k in piece.channels if role_of(k) == 'y')
+    return functools.reduce(_without_faults_of, names, _without_own_faults(record))
+
+
+def _without_faults_of(record: Record, name: str) -> Record:
+    """Return a record whose channel `name`, the displacement of another axis, is judged too."""
+    has = [i for i, p in enumerate(record) if np.isfinite(p.channels.get(name, np.nan)).all()]
+    if not has:
+        return record
+    pieces = list(record.pieces)
+    own = f'v{name[1:]}'
+
+    def turned(piece: Piece) -> Piece:
+        """Return a piece with this axis in front."""
+        channels = {**piece.channels, **({own: piece.v} if own in piece.channels else {})}
+        v = piece.channels.get(own, piece.v)
+        return replace(piece, v=v, y=piece.channels[name], channels=channels, sound=None)
+
+    alone = Record(tuple(turned(pieces[i]) for i in has), record.name)
+    judged = _without_own_faults(alone)
+    if judged is alone:
+        return record
+    for i, piece in zip(has, judged, strict=True):
+        channels = {**pieces[i].channels, name: piece.measured}
+        if own in channels:
+            channels[own] = piece.v
+        pieces[i] = replace(pieces[i], channels=channels)
+    faults = (replace(fault, where=f'in {name} {fault.where}') for fault in judged.faults)
+    return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
+
+
+def _without_own_faults(record: Record) -> Record:
+    """Return a record whose displacement is judged."""
+    if record.stroke == 0.0:
+        return record
+    span = float(np.ptp(record.voltage_range))
     stroke = record.stroke
     wild = [_wild(piece, stroke, span) for piece in record]
     for _ in range(TURNS):

@@ -149,6 +149,11 @@ class Piece:
         return np.ones(self.n, dtype=bool) if self.sound is None else self.sound
 
     @property
+    def measured(self) -> Array:
+        """The displacement [m], NaN where it does not count, shape (n,)."""
+        return self.y if self.sound is None else np.where(self.sound, self.y, np.nan)
+
+    @property
     def dt(self) -> float:
         """Sample period [s]."""
         return 1.0 / self.sample_rate

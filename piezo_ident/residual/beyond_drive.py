@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, interpolated, Mask
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.channels import role_of
 from piezo_ident.residual.coherence import coherence
@@ -220,7 +220,7 @@ def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) 
     """Return whether the drive, or drift, explains a channel."""
     left = sum(float(np.sum(p.beyond(p.own)[p.use] ** 2)) for p in found)
     whole = sum(float(np.sum((x - x.mean()) ** 2)) for x in (p.own[p.use] for p in found))
-    signals = [(part, np.asarray(part.piece.channels[name], np.float64)) for part in having]
+    signals = [(part, _known(part.piece.channels[name])) for part in having]
     of_drive = coherence([part.with_residual(c) for part, c in signals if np.isfinite(c).all()])
     return left < OWN * whole or (of_drive is not None and of_drive.share > FOLLOWS)
 
@@ -231,10 +231,15 @@ def _part_of(part: ResidualPart, channel: Array) -> _Part:
     e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, np.asarray(channel, np.float64)))
     use = part.joined[: e.size * m].reshape(-1, m).all(axis=1) & np.isfinite(c)
     use[: min(round(SETTLING * rate), e.size // 8)] = False
-    c = np.where(np.isfinite(c), c, c[use].mean() if use.any() else 0.0)
+    c = _known(c)
     drive = np.hstack([drive_functions(v, rate), _slow(e.size)])
     functions = _channel_functions(c, rate)
     return _Part(np.where(use, e, 0.0), drive, functions, c, use, rate)
+
+
+def _known(channel: Array) -> Array:
+    """Return a channel with straight lines for what is not known of it."""
+    return interpolated(channel, ~np.isfinite(channel))
 
 
 def _channel_functions(c: Array, rate: float) -> Array:

@@ -75,6 +75,42 @@ def test_a_linear_stage_is_found_to_the_noise_and_nothing_is_blamed():
     assert found.error < 3 * noise
 
 
+def lossy(record, share, length, names=('y', 'y_b')):
+    """Return a record that loses runs of its readings, and which."""
+    (piece,), rng, lost = record, np.random.default_rng(4), {}
+    columns = {'y': piece.y, **piece.channels}
+    for name in names:
+        lost[name] = np.zeros(piece.n, bool)
+        while lost[name].mean() < share:
+            start = rng.integers(1, piece.n - length)
+            lost[name][start : start + length] = True
+        columns[name] = np.where(lost[name], 0.0, columns[name])
+    spoilt = replace(piece, y=columns.pop('y'), channels=columns)
+    return pi.Record((spoilt,), 'lossy'), lost
+
+
+@pytest.mark.parametrize(('share', 'length'), [(0.016, 1), (0.05, 4)])
+def test_lost_readings_of_either_axis_are_left_out(share, length):
+    linear = replace(STAGE, hysteresis=(0.0, 0.4, 1.0), creep_gain=np.zeros(2))
+    record = linear.play(program('small', realisations=3, periods=3))
+    spoilt, lost = lossy(record, share, length)
+    sound, held = periods_of([record]), periods_of([spoilt])
+    gone = np.concatenate([~r.sound for r in held.records], axis=1)
+    assert 0.9 * share < gone.mean() < 1.2 * share
+    for a, b in zip(sound.records, held.records, strict=True):
+        # those of the other period stand in for them
+        assert abs(a.y - b.y)[:, b.sound.any(axis=0)].max() < 20e-9
+        assert np.std(b.noise) == pytest.approx(np.std(a.noise), rel=0.1)
+    if length == 1:
+        return
+    found = identify_axes([spoilt], iterations=1)
+    noise = 100 * 2e-9 / np.mean([r.y.std() for r in sound.records])
+    assert found.explanation.name == 'linear' and found.error < 1.5 * noise
+    assert all(x.of_motion < 1.5 * noise for x in found.axis_errors)
+    said = ' '.join(found.warnings)
+    assert f'lost ({lost["y"].sum()})' in said and f'lost ({lost["y_b"].sum()}) in y_b' in said
+
+
 def test_what_cannot_be_used_says_why(record):
     with pytest.raises(DataError, match='no segment of the records repeats'):
         periods_of([record.first(500)])

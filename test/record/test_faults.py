@@ -315,6 +315,28 @@ def test_the_model_of_lossy_readings_is_that_of_sound_ones():
         assert max(row.percent for row in rows) < 1.2 * good.headline.percent
 
 
+def test_the_displacement_of_another_axis_is_judged_too():
+    v_b, y_b = np.roll(V, 3000) + 1, np.roll(Y, 3000) + 30e-6
+    channels = {'v_b': v_b.copy(), 'y_b': y_b.copy(), 'heat': np.where(T == T[AT[0]], 90.0, 20.0)}
+    # a row of that axis that was lost as a whole, and readings alone
+    channels['v_b'][AT[:50]] = channels['y_b'][AT] = 0.0
+    record = Record((Piece(V, Y, RATE, channels=channels),))
+    (piece,) = (clean := without_faults(record)).pieces
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(piece.channels['y_b'])), np.sort(AT))
+    np.testing.assert_allclose(piece.channels['v_b'], v_b, atol=1e-3)
+    np.testing.assert_array_equal(piece.channels['heat'], channels['heat'])
+    assert piece.mask.all() and piece.y is record.pieces[0].y
+    (fault,) = clean.faults
+    assert (fault.name, fault.count) == ('lost', 150) and 'y_b' in fault.where
+    assert without_faults(clean) is clean
+    # where both lose readings, either is left out of its own axis alone
+    y = Y + 30e-6
+    y[AT + 7] = 0.0
+    (piece,) = without_faults(Record((Piece(V, y, RATE, channels=channels),))).pieces
+    np.testing.assert_array_equal(np.flatnonzero(~piece.mask), np.sort(AT + 7))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(piece.channels['y_b'])), np.sort(AT))
+
+
 def test_steps_rests_and_stops_are_no_lost_readings():
     rng = np.random.default_rng(3)
     # steps and pulses of the stage, late by ten samples and ringing

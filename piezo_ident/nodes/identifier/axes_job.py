@@ -31,13 +31,11 @@ def identify_axes_capture(snapshot: Snapshot, tick: Tick) -> IdentificationOutco
     tick : callable
     """
     tick('record', 0.0)
-    record = snapshot.record('capture')
-    found = identify_axes([record], progress=tick)
+    found = identify_axes([snapshot.record('capture')], progress=tick)
     tick('report', 0.98)
-    periods, name = found.periods, found.explanation.name
+    periods, name, warnings = found.periods, found.explanation.name, found.warnings
     error, linear = f'{found.error:.3g}', f'{found.linear_error:.3g}'
     size = f'{len(periods.inputs)} inputs, {len(periods.outputs)} outputs'
-    warnings = (*map(str, (f for f in record.faults if not f.is_note)), *found.warnings)
     return IdentificationOutcome(
         f'{size}: {error} % of the rms of y in free run on what was held out, a linear model '
         f'{linear} %; what that lacks: {name}',
