@@ -44,6 +44,9 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         record, pieces = run.record, run.pieces
         console.say(f'{args.model} on {record.name}, free run:')
         print_errors(run, console)
+        lost = record.n - run.errors.n
+        if lost and args.out is not None:
+            console.say(f'  {lost} readings are left out: y is nan there in {args.out}')
         data |= error_data(run)
         if args.plot is not None:
             from piezo_ident.report import save_plot
@@ -73,7 +76,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
 
 
 def _write_prediction(record: Record, pieces: Sequence[Array], path: Path) -> None:
-    blocks = blocks_of(record, y_hat=pieces)
+    # nothing that stands in for a reading is written as one
+    blocks = blocks_of(record, y=[piece.measured for piece in record], y_hat=pieces)
 
     def columns() -> Iterator[dict[str, Array]]:
         for block in blocks():

@@ -16,6 +16,7 @@ from typing import Any
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.many.figures_of_merit import figures_of_merit
+from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Record
 
 #: content of a cell
@@ -153,6 +154,7 @@ def _text(value: Value) -> str:
 
 
 def _head(record: Record) -> dict[str, Value]:
+    record = without_faults(record)
     low, high = record.voltage_range
     return {
         'sample_rate': record.pieces[0].sample_rate,

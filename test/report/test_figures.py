@@ -285,6 +285,14 @@ def test_decimated_traces_keep_their_extremes():
     assert y[k].max() == 9.0
     assert y[k].min() == -7.0
     assert np.array_equal(envelope(y[:100]), np.arange(100))
+    # a stretch that was left out breaks the line, a sample alone does not hide the others
+    broken = y.copy()
+    broken[150_000:180_000] = broken[::7] = np.nan
+    k = envelope(broken)
+    assert np.isnan(broken[k][(k > 150_200) & (k < 179_800)]).all()
+    assert np.nanmax(broken[k]) == np.nanmax(broken) and np.nanmin(broken[k]) == np.nanmin(broken)
+    assert axis_limit(broken)[1] == np.nanmax(abs(broken))
+    assert axis_limit(np.full(3, np.nan)) == (0.0, 0.0)
     assert axis_limit(y) == (pytest.approx(2.5, rel=0.01), 9.0)
     assert axis_limit(y[:1000]) == pytest.approx((1.0, 1.0), rel=0.01)
 

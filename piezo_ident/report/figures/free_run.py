@@ -39,7 +39,7 @@ def loops_figure(runs: Sequence[PieceRun]) -> Figure:
     """
     run, s = _widest_loop(runs)
     part = slice(s.start, s.stop)
-    v, y, y_hat = run.piece.v[part], run.piece.y[part], run.y_hat[part]
+    v, y, y_hat = run.piece.v[part], run.piece.measured[part], run.y_hat[part]
     fig = style.figure(5.2, 5.2)
     loops, errors = fig.subplots(2, 1, sharex=True, gridspec_kw={'height_ratios': [2.4, 1]})
     limit, largest = style.axis_limit(y - y_hat)
@@ -86,7 +86,7 @@ def _draw_error(
     limit, largest = style.axis_limit(e)
     unit, scale = style.length_unit(largest)
     remarks = [f'axis cut; largest {scale * largest:.3g} {unit}'] if largest > limit else []
-    if not np.array_equal(e, e_static):
+    if not np.array_equal(e, e_static, equal_nan=True):
         static_limit, static_largest = style.axis_limit(e_static)
         if static_limit <= READABLE * limit:
             style.line(
@@ -110,7 +110,7 @@ def record_figure(record: Record) -> Figure:
     axes = fig.subplots(2, 1, sharex=True)
     for piece in record:
         style.line(axes[0], piece.t, piece.v, COLOURS['measured'])
-        style.line(axes[1], piece.t, 1e6 * piece.y, COLOURS['measured'])
+        style.line(axes[1], piece.t, 1e6 * piece.measured, COLOURS['measured'])
     tidy(axes[0], '', 'voltage / V')
     tidy(axes[1], 'time / s', 'displacement / µm')
     axes[0].margins(x=0.01)
@@ -120,16 +120,18 @@ def record_figure(record: Record) -> Figure:
 
 def overview_figure(run: PieceRun, remark: str = '') -> Figure:
     """Draw voltage, displacement and error of a piece, with a remark on its model."""
-    piece, t = run.piece, run.piece.t
+    piece, t, y = run.piece, run.piece.t, run.piece.measured
     fig = style.figure(5.0)
     axes = fig.subplots(3, 1, sharex=True, gridspec_kw={'height_ratios': [1, 1.7, 1.4]})
     style.line(axes[0], t, piece.v, COLOURS['measured'])
-    style.line(axes[1], t, 1e6 * piece.y, COLOURS['under'], 'measured', linewidth=3.0)
+    style.line(axes[1], t, 1e6 * y, COLOURS['under'], 'measured', linewidth=3.0)
     style.line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
-    unit, scale = _draw_error(axes[2], t, piece.y - run.y_hat, piece.y - run.y_static, 0.8)
+    unit, scale = _draw_error(axes[2], t, y - run.y_hat, y - run.y_static, 0.8)
     tidy(axes[0], '', 'voltage / V')
     tidy(axes[1], '', 'displacement / µm')
-    style.note(axes[1], remark)
+    lost = np.count_nonzero(~piece.mask)
+    remarks = [remark, f'{lost} readings left out' if lost else '']
+    style.note(axes[1], '; '.join(filter(None, remarks)))
     tidy(axes[2], 'time / s', f'error / {unit}')
     _name_segments(axes[0], run)
     style.percent_axis(axes[2], scale * float(np.ptp(piece.y)))
@@ -203,7 +205,7 @@ def _readable(run: PieceRun, s: Segment) -> tuple[slice, str]:
 
 def _draw_segment(trace: Axes, error: Axes, run: PieceRun, s: Segment, remark: str) -> None:
     part, what = _readable(run, s)
-    t, y, y_hat = run.piece.t[part], run.piece.y[part], run.y_hat[part]
+    t, y, y_hat = run.piece.t[part], run.piece.measured[part], run.y_hat[part]
     long = t[-1] - t[0] > 1.0
     x = t if long else 1e3 * (t - t[0])
     style.line(trace, x, 1e6 * y, COLOURS['under'], linewidth=3.0)

@@ -141,9 +141,9 @@ def length_unit(largest: float) -> tuple[str, float]:
 
 def axis_limit(errors: Array) -> tuple[float, float]:
     """Return where to end an axis for some errors, and the largest; rare spikes are cut."""
-    sizes = np.abs(errors)
+    sizes = np.abs(errors[~np.isnan(errors)])
     largest = float(sizes.max(initial=0.0))
-    usual = ROOM * float(np.quantile(sizes, USUAL))
+    usual = ROOM * float(np.quantile(sizes, USUAL)) if sizes.size else 0.0
     return (usual if 0.0 < FAR * usual < largest else largest), largest
 
 
@@ -158,18 +158,21 @@ def envelope(y: Array, points: int = POINTS) -> Integers:
     """
     Return the samples that show every extreme of a trace: about `points`, or all of a short one.
 
-    Of a long trace these are the smallest and the largest of each stretch.
+    Of a long trace these are the smallest and the largest of each stretch; one of NaN alone keeps
+    a NaN, which breaks the line.
     """
     if y.size <= points:
         return np.arange(y.size)
     stretch = -(-2 * y.size // points)
     whole = y.size // stretch * stretch
-    rows = y[:whole].reshape(-1, stretch)
-    first = np.arange(rows.shape[0]) * stretch
-    found = [first + rows.argmin(axis=1), first + rows.argmax(axis=1)]
+    above, below = (np.where(np.isnan(y), x, y) for x in (np.inf, -np.inf))
+    first = np.arange(whole // stretch) * stretch
+    found = [
+        first + above[:whole].reshape(-1, stretch).argmin(axis=1),
+        first + below[:whole].reshape(-1, stretch).argmax(axis=1),
+    ]
     if whole < y.size:
-        rest = y[whole:]
-        found.append(whole + np.array([rest.argmin(), rest.argmax()]))
+        found.append(whole + np.array([above[whole:].argmin(), below[whole:].argmax()]))
     return np.unique(np.concatenate([*found, [0, y.size - 1]]))
 
 
