@@ -5,8 +5,10 @@
 The player node: replays a bag onto topics with the original spacing, or a multiple of it.
 
 Blocks carry their own times, so the samples that are replayed are the samples that were measured,
-bit by bit, at whatever rate.  The spacing is that of the log times, on a schedule that is counted
-from its start.  Only the measured topics are replayed unless `topics` says otherwise.
+bit by bit, at whatever rate.  Order and spacing are those of the log times, on a schedule that is
+counted from its start.  Where the clock of these was set back, the order is that of the file, as
+in a record that is read from the bag.  Only the measured topics are replayed unless `topics` says
+otherwise.
 
 Nothing is sent before every topic has met as many subscribers as `subscribers` says.  After that
 nobody is waited for; each listener reports what it lost.
@@ -14,8 +16,10 @@ nobody is waited for; each listener reports what it lost.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+import functools
 from pathlib import Path
 import threading
 import time
@@ -26,8 +30,16 @@ from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.subscriptions import message_class, qos_of, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
-from piezo_ident.record.bags.read import carried_quantities, is_computed, opened_bag
+from piezo_ident.record.bags.read import (
+    blocks_in,
+    carried_quantities,
+    is_computed,
+    LogClock,
+    ordered_bag,
+    steps_back,
+)
 from piezo_ident.record.bags.recover import Bag
+from piezo_ident.record.blocks import Samples
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
@@ -143,15 +155,16 @@ class PlayerNode(LabNode):
     def _work(self, replay: Replay) -> None:
         prepared = False
         try:
-            with opened_bag(replay.bag) as bag:
-                chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
+            look = functools.partial(self._looked_through, replay)
+            with ordered_bag(replay.bag, look) as (bag, chosen):
                 senders = self._prepared(bag, chosen)
                 replay.names = ', '.join(chosen.values())
                 replay.total = sum(c.msgcount for c in bag.connections if c.topic in senders)
                 prepared = True
                 self._await_subscribers(replay, senders)
-                schedule = self._send(replay, bag, senders)
-                self._report_end(replay, bag, schedule)
+                clock = LogClock()
+                schedule = self._send(replay, bag, senders, clock)
+                self._report_end(replay, bag, schedule, clock)
         except _Stopped:
             self._report(
                 'stopped',
@@ -163,6 +176,21 @@ class PlayerNode(LabNode):
             replay.failure = self.reason(error)
             state = 'failed' if prepared else 'refused'
             self._report(state, replay.failure, ERROR, replay.progress)
+
+    def _looked_through(self, replay: Replay, bag: Bag) -> tuple[int, dict[str, str]]:
+        """Return how many of the chosen blocks go back, and the topics that are chosen."""
+        chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
+        carried = {t: t for t in chosen if t in _carried(bag)}
+
+        def blocks() -> Iterator[tuple[str, Samples]]:
+            # what is no block is replayed as it is
+            with suppress(DataError):
+                for topic, samples, _ in blocks_in(bag, carried):
+                    if replay.stop.is_set():
+                        raise _Stopped
+                    yield topic, samples
+
+        return steps_back(blocks()), chosen
 
     def _prepared(self, bag: Bag, chosen: Mapping[str, str]) -> dict[str, Any]:
         """Return the publisher of each chosen topic of the bag."""
@@ -214,11 +242,14 @@ class PlayerNode(LabNode):
         if need:
             self._pause(replay, SETTLE)
 
-    def _send(self, replay: Replay, bag: Bag, senders: Mapping[str, Any]) -> Schedule:
+    def _send(
+        self, replay: Replay, bag: Bag, senders: Mapping[str, Any], clock: LogClock
+    ) -> Schedule:
         """Send every message when it is due."""
         schedule, first, reported = None, 0, float('-inf')
         chosen = [c for c in bag.connections if c.topic in senders]
-        for connection, stamp, raw in bag.messages(chosen):
+        for connection, logged, raw in bag.messages(chosen):
+            stamp = clock.rising(connection.topic, logged)
             now, rate = time.monotonic(), self.values['rate']
             if schedule is None:
                 # what is caught up with at once must fit into the queues of the readers
@@ -240,7 +271,7 @@ class PlayerNode(LabNode):
             schedule.note(position, 0.0, now)
             replay.messages += 1
             replay.slipped = schedule.slipped
-            replay.progress = 100.0 * (stamp - first) / max(1, bag.end - first)
+            replay.progress = 100.0 * replay.messages / replay.total
         if schedule is None:
             raise DataError(f'{bag.path}: no messages on {", ".join(senders)}; name another bag')
         return schedule
@@ -249,14 +280,15 @@ class PlayerNode(LabNode):
         if replay.stop.wait(seconds):
             raise _Stopped
 
-    def _report_end(self, replay: Replay, bag: Bag, schedule: Schedule) -> None:
+    def _report_end(self, replay: Replay, bag: Bag, schedule: Schedule, clock: LogClock) -> None:
         about = f'replayed {replay.messages} messages of {replay.bag}'
         if schedule.slipped > 0.1:
             about += f', {schedule.slipped:.1f} s slower than asked'
         faults = '; '.join(str(f) for f in bag.faults)
         early = f'the bag ends early: {faults}' if faults else ''
         level = WARN if early else OK
-        self._report('done', '; '.join(filter(None, [about, early])), level, 100.0)
+        parts = [about, *map(str, clock.faults), early]
+        self._report('done', '; '.join(filter(None, parts)), level, 100.0)
 
     # reports
 

@@ -32,8 +32,8 @@ def pair(k: int) -> tuple[Samples, Samples]:
     )
 
 
-def bag(path: Path, n: int = 200, namespace: str = '') -> list[int]:
-    """Write a bag of n pairs of blocks, 5 ms apart but for a pause in the middle."""
+def bag(path: Path, n: int = 200, namespace: str = '', pause: float = 0.2) -> list[int]:
+    """Write a bag of n pairs of blocks, 5 ms apart but for a pause in the middle [s]."""
     store = typestore()
     writer = BagWriter(path)
     for quantity in ('voltage', 'displacement'):
@@ -45,7 +45,7 @@ def bag(path: Path, n: int = 200, namespace: str = '') -> list[int]:
     )
     stamps = []
     for k in range(n):
-        stamp = 10**18 + k * 5_000_000 + (200_000_000 if k >= n // 2 else 0)
+        stamp = 10**18 + k * 5_000_000 + (round(1e9 * pause) if k >= n // 2 else 0)
         stamps.append(stamp)
         for quantity, samples in zip(('voltage', 'displacement'), pair(k), strict=True):
             raw = serialize_message(to_message(samples))
@@ -78,6 +78,7 @@ def lab(tmp_path_factory):
             ('player', {'wait_limit': 0.3}, 'c'),
             # the recorder, and who looks
             ('player', {'subscribers': 2}, 'd'),
+            ('player', {}, 'e'),
             ('recorder', recorder, 'd'),
         )
         yield g
@@ -185,3 +186,17 @@ def test_record_and_replay(lab, tmp_path):
     lab.wait(lambda: len(first) >= 200 and len(second) >= 200, 'all blocks again')
     assert same(second[100:], [pair(k)[1] for k in range(100)])
     assert same(first[100:], first[:100])
+
+
+def test_a_log_clock_that_was_set_back_does_not_mix_the_blocks(lab, tmp_path):
+    # as by NTP: the second half lies within the first, by the times of the log
+    bag(tmp_path / 'bag', 60, pause=-0.2)
+    voltage, displacement = lab.collect('/e/voltage'), lab.collect('/e/displacement')
+    assert lab.set('e/player', 'bag', str(tmp_path / 'bag'))[0]
+    status = lab.finish('e/player/start')
+    assert (status['state'], status['messages'], status['progress']) == ('done', '120', '100')
+    # by 0.2 s, less the time between two blocks
+    assert 'log_time_step (1) by 0.195 s' in status['text']
+    for i, blocks in enumerate((voltage, displacement)):
+        lab.wait(lambda b=blocks: len(b) >= 60, 'all blocks')
+        assert same(blocks, [pair(k)[i] for k in range(60)])

@@ -12,14 +12,14 @@ far as it goes when that is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import replace
 import functools
 import itertools
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.record.bags.recover import (
@@ -44,6 +44,8 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
+
+T = TypeVar('T')
 
 
 @functools.cache
@@ -131,28 +133,80 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
     """
     path = Path(path)
     options = replace(options or ReadOptions(), **choices)
-    with opened_bag(path) as bag:
+    topics: dict[str, str] = {}
+
+    def read(bag: Bag) -> tuple[int, _Blocks]:
         if bag.faults and not options.recover:
             raise DataError(
                 f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
                 f"'piezo_ident convert {path} OUT' saves what is whole of it"
             )
         asked = {'voltage': options.voltage_topic, 'displacement': options.displacement_topic}
-        topics = _choose(carried_quantities(bag), asked, options.namespace, path)
+        topics.update(topics or _choose(carried_quantities(bag), asked, options.namespace, path))
         blocks = _Blocks(bag, topics)
-    # in the file of a clock that was set back, the samples go on
-    if blocks.back:
-        with suppress(DataError), opened_bag(path, in_file_order=True) as other:
-            recorded = _Blocks(other, topics)
-            if recorded.back < blocks.back and not other.faults:
-                blocks = recorded
-    return record_of_streams(
-        blocks.streams,
-        name=str(path),
-        options=options,
-        sample_rate=_sample_rate(path),
-        faults=(*bag.faults, *blocks.faults),
-    ).renamed(path.name)
+        return blocks.back, blocks
+
+    with ordered_bag(path, read) as (bag, blocks):
+        return record_of_streams(
+            blocks.streams,
+            name=str(path),
+            options=options,
+            sample_rate=_sample_rate(path),
+            faults=(*bag.faults, *blocks.clock.faults),
+        ).renamed(path.name)
+
+
+@contextmanager
+def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Iterator[tuple[Bag, T]]:
+    """
+    Open a bag whose messages come in the order in which its samples go on.
+
+    That is the order of the log times, or, where the clock of these was set back, that of the
+    file.  `look` returns how many blocks go back in a bag, see `steps_back`, and what else it
+    found, which is that of the bag that is taken.
+    """
+    with ExitStack() as stack:
+        bag = stack.enter_context(opened_bag(path))
+        back, found = look(bag)
+        if back:
+            with suppress(DataError):
+                other = stack.enter_context(opened_bag(path, in_file_order=True))
+                fewer, again = look(other)
+                if fewer < back and not other.faults:
+                    bag, found = other, again
+        yield bag, found
+
+
+class LogClock:
+    """
+    Log times that rise on every topic: later by what their clock was set back.
+
+    >>> clock = LogClock()
+    >>> [clock.rising('v', stamp) for stamp in (5, 6, 3, 4)], clock.steps
+    ([5, 6, 6, 7], [3])
+    """
+
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+        self._shift = 0
+        self._last: dict[str, int] = {}
+
+    def rising(self, topic: str, stamp: int) -> int:
+        """Return the log time [ns] of the next message."""
+        last = self._last.get(topic, stamp + self._shift)
+        if stamp + self._shift < last:
+            self.steps.append(last - self._shift - stamp)
+            self._shift = max(self._last.values()) - stamp
+        self._last[topic] = stamp + self._shift
+        return self._last[topic]
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Whether the clock was set back."""
+        where = f'by {max(self.steps, default=0) / 1e9:.3g} s from one block to the next'
+        action = 'blocks taken in the order of the file'
+        fault = Fault('log_time_step', where, len(self.steps), action)
+        return (fault,) if self.steps else ()
 
 
 class _Blocks:
@@ -164,29 +218,30 @@ class _Blocks:
     streams : dict of str to BlockStream
     back : int
         How many blocks begin before the end of the one before.
-    faults : tuple of Fault
-        Whether the clock of the log times was set back.
+    clock : LogClock
     """
 
     def __init__(self, bag: Bag, topics: Mapping[str, str]) -> None:
         self.streams = {quantity: BlockStream(spooled=True) for quantity in topics}
-        self.back = 0
-        ends = dict.fromkeys(topics, -math.inf)
-        # later by what the clock was set back, so that they rise on every topic
-        stamps, shift = dict.fromkeys(topics, -(2**63)), 0
-        steps: list[int] = []
-        for quantity, samples, stamp in _blocks(bag, topics):
-            if stamp + shift < stamps[quantity]:
-                steps.append(stamps[quantity] - shift - stamp)
-                shift = max(stamps.values()) - stamp
-            stamps[quantity] = stamp + shift
-            self.streams[quantity].append(samples, stamp + shift)
-            if samples.t.size:
-                self.back += bool(samples.t[0] <= ends[quantity])
-                ends[quantity] = float(samples.t[-1])
-        where = f'by {max(steps, default=0) / 1e9:.3g} s from one block to the next'
-        fault = Fault('log_time_step', where, len(steps), 'blocks taken in the order of the file')
-        self.faults = (fault,) if steps else ()
+        self.clock, self.back = LogClock(), 0
+
+        def kept() -> Iterator[tuple[str, Samples]]:
+            for quantity, samples, stamp in blocks_in(bag, topics):
+                self.streams[quantity].append(samples, self.clock.rising(quantity, stamp))
+                yield quantity, samples
+
+        self.back = steps_back(kept())
+
+
+def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
+    """Return how many blocks begin before the end of the one before of the same quantity."""
+    ends: dict[str, float] = {}
+    back = 0
+    for quantity, samples in blocks:
+        if samples.t.size:
+            back += bool(samples.t[0] <= ends.get(quantity, -math.inf))
+            ends[quantity] = float(samples.t[-1])
+    return back
 
 
 def _sample_rate(path: Path) -> float | None:
@@ -312,7 +367,7 @@ def _measured_topic(
     return fit[0]
 
 
-def _blocks(bag: Bag, topics: Mapping[str, str]) -> Iterator[tuple[str, Samples, int]]:
+def blocks_in(bag: Bag, topics: Mapping[str, str]) -> Iterator[tuple[str, Samples, int]]:
     """Yield quantity, samples and log time [ns] of every block, in the order of the bag."""
     quantities = {topic: quantity for quantity, topic in topics.items()}
     index = dict.fromkeys(quantities, 0)
