@@ -84,12 +84,17 @@ class Option:
 
 @dataclass(frozen=True)
 class Setting:
-    """What every signal may need to know: the rate [Hz], limits and rest [V], and chance."""
+    """
+    What every signal may need to know: the rate [Hz], limits and rest [V], chance, and the unit.
+
+    Where the unit is another one, so are the levels; it stands in the names of segments.
+    """
 
     sample_rate: float
     limits: tuple[float, float]
     rest: float
     rng: np.random.Generator
+    unit: str = 'V'
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +156,7 @@ def _idle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 @_signal('hold', level=_LEVEL, duration=_TIME)
 def _hold(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     v = excitation.staircase([o['level']], [o['duration']], s.sample_rate)
-    return _periodic(v, f'{o["level"]:g}V')
+    return _periodic(v, f'{o["level"]:g}{s.unit}')
 
 
 @_signal('step', bias=_LEVEL, size=_SIZE, hold=_TIME, count=_COUNT)
@@ -260,7 +265,7 @@ def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
             excitation.corners(
                 _about(bias, [o['amplitude']] * o['cycles']), o['slope'], s.sample_rate
             ),
-            f'minor-{bias:g}V',
+            f'minor-{bias:g}{s.unit}',
         )
     ]
 

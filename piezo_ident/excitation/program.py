@@ -115,6 +115,8 @@ class Program:
         Voltage before and after [V].
     slew : float
         Largest speed of the ramps [V/s].
+    unit : str
+        What its levels are in, of a program that is no voltage; it stands in labels.
 
     Examples
     --------
@@ -132,6 +134,7 @@ class Program:
     seed: int = 0
     rest: float = 0.0
     slew: float = 20.0
+    unit: str = 'V'
 
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> Program:
@@ -188,9 +191,8 @@ class Program:
                 f'{self.name}: the rest voltage {self.rest:g} V lies outside the limits '
                 f'{low:g} .. {high:g} V'
             )
-        setting = Setting(
-            rate, (low, high), self.rest, np.random.default_rng(self.seed) if rng is None else rng
-        )
+        rng = np.random.default_rng(self.seed) if rng is None else rng
+        setting = Setting(rate, (low, high), self.rest, rng, self.unit)
         return self._join(
             chain.from_iterable(
                 self._parts(number, entry, setting) for number, entry in enumerate(self.entries, 1)

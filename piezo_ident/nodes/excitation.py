@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import re
@@ -154,7 +154,8 @@ class ExcitationNode(LabNode):
         if self._built is None or self._built[0] != key or '\n' not in text:
             try:
                 count = 1 + sum(map(bool, values.get('axes', ())))
-                built = build_axes(read_program(text), count, values['sample_rate'], limits)
+                program = replace(read_program(text), unit=UNITS[self.values['quantity']][0])
+                built = build_axes(program, count, values['sample_rate'], limits)
             except ConfigError as error:
                 raise self._in_unit(error) from None
             except (OSError, MemoryError) as error:

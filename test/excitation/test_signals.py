@@ -3,6 +3,7 @@
 
 """Signals and programs: what they promise, and what would prove it wrong."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 from hypothesis import assume, given, settings
@@ -307,6 +308,15 @@ def test_neighbours_never_share_a_label():
     assert [x.label for x in s.segments] == ['ramp', 'hold:4V', 'hold:4V-2', 'hold:4V', 'ramp']
     s = program({**hold, 'name': 'warm'}, hold).build(1000)
     assert [x.label for x in s.segments][1:3] == ['hold:warm', 'hold:4V']
+
+
+def test_the_labels_of_a_reference_name_its_own_unit():
+    loops = {'signal': 'minor_loops', 'biases': [3, 5], 'amplitude': 1, 'cycles': 1}
+    asked = program({'signal': 'hold', 'level': 4, 'duration': 0.1}, loops)
+    for unit in ('V', 'um'):
+        labels = {x.label for x in replace(asked, unit=unit).build(1000).segments}
+        kinds = {f'hold:4{unit}', f'triangle:minor-3{unit}', f'triangle:minor-5{unit}'}
+        assert labels == {'ramp', *kinds}
 
 
 def test_numbers_that_yaml_reads_as_text_are_numbers():

@@ -244,6 +244,7 @@ def test_one_drives_at_a_time(lab):
 def test_programs_in_micrometres_are_a_reference(lab):
     program = 'limits: [0, 70]\nrest: 5\nslew: 500\nsegments:\n  - {signal: idle, duration: 0.1}\n'
     program += '  - {signal: sine, bias: 35, amplitude: 25, frequency: 50, periods: 10}\n'
+    program += '  - {signal: hold, level: 30, duration: 0.05}\n'
     limits = {'voltage_high': 100.0, 'ramp_slew': 500.0}
     # one reference at a time, too
     lab.unpublish('reference')
@@ -256,7 +257,9 @@ def test_programs_in_micrometres_are_a_reference(lab):
     armed(lab)
     assert lab.call('excitation/start')[0]
     is_in(lab, 'done')
-    _, e = column([b for b in lab.collect('tracking_error')[since:] if 'sine' in b.segment])
+    blocks = lab.collect('tracking_error')[since:]
+    assert {b.segment for b in blocks if b.segment.startswith('hold')} == {'hold:30um'}
+    _, e = column([b for b in blocks if 'sine' in b.segment])
     assert e.size > 3000 and 100.0 * np.sqrt(np.mean(e**2)) / 50e-6 < 0.02
     assert lab.handle('excitation').stop() == 0
 
