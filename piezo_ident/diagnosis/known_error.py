@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.identification.fast_motion import high_passed
+from piezo_ident.identification.spectra import high_passed
 from piezo_ident.model.stage_model import StageModel
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.fast_motion import high_passed
 from piezo_ident.identification.prepare import Run, runs_of
 from piezo_ident.identification.results import ErrorRow, Memories
+from piezo_ident.identification.spectra import high_passed
 from piezo_ident.identification.step3_hysteresis import factorise, fine_thresholds, fit_hysteresis
 from piezo_ident.model.initial_memory import early_part, fit_start
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes

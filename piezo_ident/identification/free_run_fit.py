@@ -76,7 +76,7 @@ def fit_free_run(
     IdentificationError
         When what is left to fit or to judge by is too short, or does not move.
     """
-    chosen, parts = fitted_parts(runs, settings, spread=True)
+    chosen, parts = fitted_parts(runs, settings)
     _refuse_rest(chosen, parts)
     stretches, guesses = _stretches(chosen, parts)
     search = _search(stretches, guesses, settings, progress)
@@ -335,7 +335,7 @@ def _swarm(stage: Stage, runs: Sequence[Run], settings: Settings) -> HysteresisF
 def _delay_result(fits: _Fits, settings: Settings, rate: float, band: float) -> DelayResult:
     d = fits.last.stage.delay
     if settings.delay is not None:
-        return DelayResult(settings.delay, 0.0, 'given')
+        return DelayResult(settings.delay, float('inf'), 'given')
     if d == 0 and fits.last.stage.dynamics.is_static:
         return DelayResult(0, float('inf'), 'none')
     # a drive that ends at f leaves a doubt of half a period of f

@@ -84,10 +84,13 @@ def linear_starts(
     rate = stretches[0].rate
     sos = butter(2, HIGH_PASS * rate, 'highpass', fs=rate, output='sos')
     found: dict[tuple[int, int], tuple[float, int, Dynamics]] = {}
-    for filtered in (False, True):
-        pairs = [(w - w[0], s.x - s.x[0]) for w, s in zip(inputs, stretches, strict=True)]
-        if filtered:
-            pairs = [(sosfilt(sos, w), sosfilt(sos, x)) for w, x in pairs]
+    raw = [(w, s.x) for w, s in zip(inputs, stretches, strict=True)]
+    for pairs in (
+        [(w - w[0], x - x[0]) for w, x in raw],
+        # a start on the move is no rest
+        [(w - w.mean(), x - x.mean()) for w, x in raw],
+        [(sosfilt(sos, w - w[0]), sosfilt(sos, x - x[0])) for w, x in raw],
+    ):
         for (na, nb), d, G in _by_least_squares(pairs, stretches, orders, allowed.delays):
             left = _free_run_left(G, d, inputs, stretches)
             if (na, nb) not in found or left < found[na, nb][0]:

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What is held out of unlabelled runs: the end, unless the rest would lack what only it excites.
+What is held out of unlabelled runs: stretches that leave most of every band and of the range.
 
-A record that ends in its only chirp would lose G to its own test.  Then another stretch of the
-same length is held out, one that leaves most of every band and of the range in the rest.
+A record that ends in its only chirp would lose G to its own test, and one with a single step too.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ import itertools
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.fast_motion import EDGES, FAINT, HIGH_PASS, rms_above
 from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import Settings
+from piezo_ident.identification.spectra import HIGH_PASS, rms_above
 
 #: samples at the end of an unlabelled record that an error needs at least
 MIN_HELD = 10
@@ -30,23 +29,20 @@ MOVES = 0.02
 MOST_RUNS = 8
 #: stretches that are held out of a run together (taste)
 STRETCHES = 4
-#: places that are tried, from the end backwards
+#: places of the stretches that are tried, from the end backwards
 PLACES = 20
-#: share of the range, and of the energy of every band, that has to stay in the rest
+#: edges of the bands [Hz] above `HIGH_PASS`, and the rms of a band that counts, normalised
+EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
+#: share of the range, and of the energy of every band, that has to stay in the rest (taste)
 STAYS = 0.65
-#: share of the mean travel that the held-out stretch needs to be a test
-TRAVELS = 0.3
 
 
-def fitted_parts(
-    runs: Sequence[Run], settings: Settings, spread: bool = False
-) -> tuple[list[Run], list[Mask]]:
+def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], list[Mask]]:
     """
     Return the runs that are fitted, the widest first, and which samples of each.
 
-    With `hold_out` set it is always the end that is held out.  `spread`: else a few stretches all
-    over each run.  IdentificationError when what is
-    left of the widest to fit or to judge by is too short.
+    With `hold_out` set the end is held out, else a few stretches all over each run.
+    IdentificationError when what is left of the widest to fit or to judge by is too short.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
     chosen: list[Run] = []
@@ -58,14 +54,10 @@ def fitted_parts(
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
         if n_held >= MIN_HELD and n_fit >= MIN_FIT:
-            fitted = np.ones(piece.n, dtype=bool)
-            if spread and not settings.hold_out:
-                # the end is among them: stretches in between would not show what drifts
-                for stop in np.linspace(0, piece.n, STRETCHES + 1).astype(int)[1:]:
-                    fitted[stop - n_held // STRETCHES : stop] = False
+            if settings.hold_out:
+                fitted = np.arange(piece.n) < n_fit
             else:
-                start = n_fit if settings.hold_out else held_out_place(run.u, rate, n_held)
-                fitted[start : start + n_held] = False
+                fitted = ~held_out_stretches(run.u, rate, n_held)
             enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
             if enough or not chosen:
                 chosen.append(run)
@@ -85,26 +77,28 @@ def fitted_parts(
     return chosen, masks
 
 
-def held_out_place(u: Array, rate: float, n_held: int) -> int:
-    """Return where a stretch of `n_held` samples of a normalised voltage u is best held out."""
-    n = u.size
+def held_out_stretches(u: Array, rate: float, n_held: int) -> Mask:
+    """
+    Return which samples of a normalised voltage u are held out, shape (n,).
+
+    They are `n_held` samples in a few stretches all over the run.  The end is among them where it
+    can be: stretches in between would not show what drifts.  Where the rest would lack what only
+    they excite, all stretches move towards the beginning.
+    """
+    n, size = u.size, n_held // STRETCHES
+    ends = np.linspace(0, n, STRETCHES + 1).astype(int)[1:]
     above = [rms_above(u, rate, edge) ** 2 for edge in (HIGH_PASS, *EDGES)]
     bands = [np.maximum(b - h, 0.0) for b, h in itertools.pairwise([*above, np.zeros(n)])]
-    energy = [np.cumsum(np.concatenate([[0.0], b])) for b in bands if b.max() > FAINT**2]
-    travel = np.cumsum(np.concatenate([[0.0], np.abs(np.diff(u, prepend=u[0]))]))
-    best, best_share = n - n_held, -1.0
-    for start in np.linspace(n - n_held, 0, PLACES).astype(int):
-        stop = start + n_held
-        rest = np.concatenate([u[:start], u[stop:]])
-        moved = (travel[stop] - travel[start]) / n_held
-        if moved < TRAVELS * travel[-1] / n:
-            continue
-        share = min(
-            [float(np.ptp(rest) / max(float(np.ptp(u)), np.finfo(float).tiny)) ** 4]
-            + [float(1.0 - (e[stop] - e[start]) / e[-1]) for e in energy]
-        )
+    bands = [b for b in bands if b.max() > FAINT**2]
+    swing = max(float(np.ptp(u)), np.finfo(float).tiny)
+    best, best_share = np.zeros(n, dtype=bool), -1.0
+    for shift in np.linspace(0, n // STRETCHES - size, PLACES).astype(int):
+        held = np.zeros(n, dtype=bool)
+        for end in ends - shift:
+            held[end - size : end] = True
+        share = min([float(np.ptp(u[~held])) / swing, *(b[~held].sum() / b.sum() for b in bands)])
         if share >= STAYS:
-            return int(start)
+            return held
         if share > best_share:
-            best, best_share = int(start), share
+            best, best_share = held, share
     return best

@@ -30,6 +30,7 @@ from piezo_ident.identification.errors import (
     squares_left,
     validation_errors,
 )
+from piezo_ident.identification.free_run_fit import fit_free_run
 from piezo_ident.identification.prepare import (
     Excerpt,
     fault_lines,
@@ -62,7 +63,6 @@ from piezo_ident.identification.three_steps import (
     triangle_excerpts,
     within,
 )
-from piezo_ident.identification.unlabelled import fit_unlabelled
 from piezo_ident.identification.warnings import warn_of_delay, warn_of_shape, warnings_of
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.scaling import Scaling
@@ -150,7 +150,7 @@ def _identify(
     def fitted(runs: Sequence[Run]) -> FitOutcome:
         if data.labelled:
             return _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
-        return fit_unlabelled(runs, data.rate, scaling, settings, progress)
+        return fit_free_run(runs, data.rate, scaling, settings, progress)
 
     def predicted(fit: FitOutcome) -> tuple[StageModel, list[Prediction]]:
         judged, memories = fit.judged or (fit.model, fit.memories)

@@ -34,6 +34,8 @@ ROW_SPAN = 2e-3
 #: samples in a row whose readings may be lost where the voltage turns (taste; held-out blocks,
 #: which hold no turn, are longer)
 LOST = 50
+#: averages that tell a correlation at least (taste)
+AVERAGES = 20
 #: samples of all records that are used, at some 60 bytes each; of longer ones the first
 MOST_SAMPLES = 40_000_000
 
@@ -324,11 +326,30 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
     stroke = max(float(p.y.max()) for p in pieces) - min(float(p.y.min()) for p in pieces)
     if stroke == 0.0:
         raise IdentificationError('the displacement is constant; is the sensor connected?')
-    covariance = sum(float(np.sum((p.v - p.v.mean()) * (p.y - p.y.mean()))) for p in pieces)
-    sign = 1.0 if covariance >= 0.0 else -1.0
+    sign = 1.0 if max(map(_correlation, pieces), key=abs) >= 0.0 else -1.0
     widest = max(pieces, key=lambda p: float(np.ptp(p.v)))
     y0 = float(widest.y[np.argmin(widest.v)])
     return Scaling(v0=low, V=high - low, y0=y0, Y=sign * stroke, range=(low, high))
+
+
+def _correlation(piece: Piece) -> float:
+    """
+    Return the correlation of voltage and displacement, of averages over the time that shows most.
+
+    Above a resonance a stage moves against its voltage, so that fast motion tells no sign.  Few
+    averages correlate by chance: n of them by 1 / sqrt(n).
+    """
+    best = 0.0
+    size = 1
+    while (n := piece.n // size) >= AVERAGES or size == 1:
+        v, y = (x[: n * size].reshape(n, size).mean(axis=1) for x in (piece.v, piece.y))
+        v, y = v - v.mean(), y - y.mean()
+        energy = float(np.sqrt((v @ v) * (y @ y)))
+        r = float(v @ y) / energy if energy > 0.0 else 0.0
+        r = float(np.copysign(max(0.0, abs(r) - 1.0 / np.sqrt(n)), r))
+        best = max(best, r, key=abs)
+        size *= 2
+    return best
 
 
 def runs_of(

@@ -56,8 +56,8 @@ class Settings:
     swarm_size, swarm_iterations : int
         Size of the swarm, and most iterations.
     hold_out : float, optional
-        Seconds at the end of an unlabelled record that are not fitted; a fifth of it, at least
-        1.5 s and at most a quarter, when absent.
+        Seconds at the end of an unlabelled record that are not fitted; a fifth of it in four
+        stretches when absent.
     seed : int
         For everything that is drawn by chance.
 
@@ -335,7 +335,8 @@ class Identification(Showable):
     records : tuple of Record
         What was fitted, then what was given for validation.
     memories : mapping of (str, float) to ndarray or Start
-        Fitted play outputs at the start of a piece, by record name and start time.
+        Fitted play outputs at the start of a piece, and creep that goes on there, by record name
+        and start time.
 
     Examples
     --------

@@ -12,12 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.coherence import cross_spectra
-from scipy import fft, signal
+from scipy import fft, ndimage, signal
 
 #: longest segment of a frequency response [samples]
 SEGMENT = 8192
 #: a response of any motion keeps points of at most this relative standard deviation
 TRUSTED = 0.1
+#: below this the slow part of a signal is taken away [Hz]
+HIGH_PASS = 30.0
+#: time over which the size of fast motion is taken [s]
+WINDOW = 0.1
 #: fewer points are no response, but that of a few sines
 POINTS = 20
 
@@ -175,3 +179,23 @@ def highest_frequency(u: Array, rate: float) -> float:
     if total[-1] == 0.0:
         return rate / 2.0
     return float(frequency[int(np.searchsorted(total, (1.0 - 1e-6) * total[-1]))])
+
+
+def high_passed(x: Array, rate: float) -> Array:
+    """Return a signal above `HIGH_PASS`; all but its start where the rate is too low for that."""
+    if 4.0 * HIGH_PASS > rate:
+        return np.asarray(x - x[0])
+    sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
+    return np.asarray(signal.sosfilt(sos, x - x[0]))
+
+
+def rms_above(u: Array, rate: float, edge: float) -> Array:
+    """Return the rms above a frequency around each sample, shape (n,)."""
+    if 4.0 * edge > rate:
+        return np.zeros(u.size)
+    width = max(1, int(WINDOW * rate))
+    sos = signal.butter(2, edge, btype='highpass', fs=rate, output='sos')
+    # both ways, with the ends turned over: a record that starts on the move does not jump there
+    pad = min(u.size - 1, int(3.0 * rate / edge))
+    power = ndimage.uniform_filter1d(signal.sosfiltfilt(sos, u, padlen=pad) ** 2, width)
+    return np.asarray(np.sqrt(np.maximum(power, 0.0)))

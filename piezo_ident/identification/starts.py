@@ -22,12 +22,10 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.identification.prepare import Excerpt, Run
-from piezo_ident.identification.results import DelayResult
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
 )
-from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 
@@ -56,9 +54,6 @@ PULL = 1e-3
 TURNS = 12
 #: smallest fall of the loss that is worth another turn, as a share of it
 WORTH = 1e-3
-#: a start is left out where H errs so many times more behind it, and the voltage rises and falls
-#: there by this share of its swing
-HARM, ENOUGH = 4.0, 0.8
 
 
 class _Thinned:
@@ -298,36 +293,6 @@ def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
         if rule is not None:
             found[i] = replace(runs[i], memory=rule, known=runs[i].use)
     return found
-
-
-def without_harm(
-    runs: Sequence[Run], excerpts: Sequence[Excerpt], G: Dynamics, found: DelayResult
-) -> tuple[list[Run], list[Excerpt]]:
-    """
-    Return runs and their excerpts without the start where it spoils H behind it.
-
-    Noise at one voltage hardly tells the memory that it starts with, and a wrong one bends all.
-    """
-    known = [replace(e, use=e.use & r.known) for e, r in zip(excerpts, runs, strict=True)]
-    swing = max(e.swing for e in excerpts)
-    enough = all(_rise_and_fall(e.u[e.use]) > ENOUGH * swing for e in known)
-    pairs = zip(excerpts, known, strict=True)
-    if not enough or all(np.array_equal(a.use, b.use) for a, b in pairs):
-        return list(runs), list(excerpts)
-    r, delay = even_thresholds(swing, COUNT), Delay(found.samples, found.fraction)
-    R = factorise(known, r, G, delay)
-    both, alone = (fit_hysteresis(S, r) for S in (factorise(excerpts, r, G, delay), R))
-    if both.left(R) < HARM**2 * alone.left(R):
-        return list(runs), list(excerpts)
-    return [replace(run, use=run.use & run.known) for run in runs], known
-
-
-def _rise_and_fall(u: Array) -> float:
-    """Return the smaller of the largest rise and the largest fall of a voltage."""
-    if not u.size:
-        return 0.0
-    rise, fall = u - np.minimum.accumulate(u), np.maximum.accumulate(u) - u
-    return float(min(rise.max(), fall.max()))
 
 
 def _rule(u0: float, r: Array, memory: Array) -> Rule:

@@ -10,17 +10,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.identification.errors import Prediction
-from piezo_ident.identification.fast_motion import behind_jumps, FAST, HIGH_PASS, rms_above
 from piezo_ident.identification.hold_out import MOVES
-from piezo_ident.identification.linear_part import GAIN, LinearPart
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import (
     DelayResult,
     DynamicsResult,
     Identification,
-    Settings,
 )
-from piezo_ident.identification.step1_delay import MAX_DELAY, no_step
+from piezo_ident.identification.step1_delay import no_step
 from piezo_ident.identification.step3_choice import PAPER_COUNT
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.scaling import Scaling
@@ -193,52 +190,6 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     return warnings
 
 
-def reasons_of(
-    excerpts: Sequence[Excerpt],
-    delay: DelayResult,
-    linear: LinearPart | None,
-    settings: Settings,
-    rate: float,
-) -> dict[str, str]:
-    """
-    Return which of delay, dynamics and hysteresis unlabelled runs do not tell, and why.
-
-    Parameters
-    ----------
-    excerpts : sequence of Excerpt
-        What was fitted.
-    delay : DelayResult
-    linear : LinearPart or None
-        What fast motion showed; None where there is too little of it.
-    settings : Settings
-    rate : float
-        [Hz]
-    """
-    missing = {}
-    slow = _no_fast_motion(excerpts, rate) if linear is None else ''
-    if delay.source == 'none':
-        missing['delay'] = slow or (
-            f'no delay below {MAX_DELAY} samples lowers the error on held-out fast motion by '
-            f'{GAIN:.0%}; add steps or noise'
-        )
-    if linear is None:
-        missing['dynamics'] = slow
-    elif linear.fit is None and linear.largest == 0:
-        missing['dynamics'] = (
-            'the fast motion is too short to fit any order to; add steps or noise'
-        )
-    elif linear.fit is None:
-        largest = f'no order up to ({linear.largest}, {linear.largest}) errs'
-        given = f'the order {settings.order} that was given does not err'
-        missing['dynamics'] = (
-            f'{given if settings.order else largest} {GAIN:.0%} less on held-out fast motion than '
-            'the hysteresis and a pure delay; add steps or noise'
-        )
-    if reason := only_jumps(excerpts):
-        missing['hysteresis'] = reason
-    return missing
-
-
 def only_jumps(excerpts: Sequence[Excerpt]) -> str:
     """Say that the voltage leaves too much out between its levels, where it does."""
     gap = min(map(_jumped_over, (e.u for e in excerpts)))
@@ -248,27 +199,6 @@ def only_jumps(excerpts: Sequence[Excerpt]) -> str:
     return (
         f'the voltage only jumps between levels, and {gap:.0%} of its range lies between two '
         'neighbours and was never seen; add a slow triangle'
-    )
-
-
-def _no_fast_motion(excerpts: Sequence[Excerpt], rate: float) -> str:
-    """Say why there is no fast motion to find delay and dynamics in."""
-    power = np.concatenate([rms_above(e.u, rate, HIGH_PASS)[e.use] ** 2 for e in excerpts])
-    rms = float(np.sqrt(power.mean()))
-    if rms > FAST or any((behind_jumps(e.u, rate) & e.use).any() for e in excerpts):
-        return (
-            'the voltage jumps or moves fast, but not for long enough to fit dynamics and to '
-            'judge them; add steps or noise'
-        )
-    if 4.0 * HIGH_PASS > rate:
-        return (
-            f'the voltage has no jump out of a rest, and in a record of {rate:.4g} Hz other '
-            f'motion is too slow: it counts above {HIGH_PASS:g} Hz, sampled at '
-            f'{4.0 * HIGH_PASS:g} Hz or more; add steps, or sample faster'
-        )
-    return (
-        f'the voltage has no jump out of a rest, and moves by {100.0 * rms:.2g} % of its range '
-        f'above {HIGH_PASS:g} Hz (rms), of which {100.0 * FAST:g} % are needed; add steps or noise'
     )
 
 
@@ -359,15 +289,4 @@ def warn_of_zeros(offsets: Mapping[tuple[str, float], float], scaling: Scaling) 
         'its errors are told without it'
         for (record, _), offset in offsets.items()
         if abs(offset) > ZERO_MOVED * abs(scaling.Y)
-    ]
-
-
-def warn_of_starts(runs: Sequence[Run], used: Sequence[Run]) -> list[str]:
-    """Return a warning where the start of a run was left out of the fit of H."""
-    return [
-        f'{run.record}: H was fitted without its first '
-        f'{np.argmax(left.use) / run.piece.sample_rate:.4g} s; what the stage did before is not '
-        'known, and no guess suits them. Begin with a sweep over the whole range'
-        for run, left in zip(runs, used, strict=True)
-        if not np.array_equal(run.use, left.use)
     ]

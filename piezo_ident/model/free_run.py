@@ -334,7 +334,7 @@ def piece_runs(
     """
     Run a model over all pieces that have its sampling rate.
 
-    `memories` are the play outputs at the start of a piece, by the name of the record and the
+    `memories` are the starts of pieces, by the name of the record and the
     start time of the piece; unknown ones are estimated as in `free_run`.
     """
     static = model.without_dynamics()

@@ -4,11 +4,9 @@
 """A delay that steps or the loss tell, and what a free run over noise says of it."""
 
 import numpy as np
-from piezo_ident.identification.delay_check import delay_behind, upheld
-from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.delay_check import upheld
 from piezo_ident.identification.results import DelayResult
-from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
-from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
 from scipy import signal
 
@@ -68,49 +66,3 @@ def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
     y += 5.0 * y.std() * some.standard_normal(u.size)
     found = upheld(nothing, *split(u, y))
     assert found.source == 'none'
-
-
-def slow_motion(delay):
-    """Return a sine of varying size through plays and a delay, to fit and to judge by."""
-    t = np.arange(800) / 200.0
-    u = 0.5 - 0.5 * np.cos(2 * np.pi * t) * (0.55 + 0.45 * np.cos(2 * np.pi * t / 4))
-    x = Delay(delay).apply(Hysteresis([0.1, 0.3], [0.2, 0.2], 0.0, 1.0)(u))
-    x = x + 1e-3 * np.random.default_rng(0).standard_normal(t.size)
-    judged = np.arange(t.size) > 600
-    return Excerpt(u, x, ~judged), Excerpt(u, x, judged)
-
-
-def test_slow_motion_tells_a_delay_or_its_errors():
-    r = np.arange(1, 10) / 10.0
-    fitted, judged = slow_motion(3)
-    found = delay_behind([fitted], [judged], r)
-    assert (found.samples, found.source) == (3, 'free run')
-    assert found.std < 1.0
-    none = delay_behind([slow_motion(0)[0]], [slow_motion(0)[1]], r)
-    assert (none.samples, none.source) == (0, 'free run')
-    long = delay_behind([slow_motion(60)[0]], [slow_motion(60)[1]], r)
-    assert 'the largest delay that is tried, 30 samples' in long
-
-
-def test_a_voltage_that_hardly_moves_in_thirty_samples_tells_no_delay():
-    u = 0.5 - 0.5 * np.cos(np.linspace(0.0, 9.0, 40_000))
-    x = u + 1e-2 * np.random.default_rng(0).standard_normal(u.size)
-    judged = np.arange(u.size) > 30_000
-    said = delay_behind([Excerpt(u, x, ~judged)], [Excerpt(u, x, judged)], np.array([0.3, 0.6]))
-    assert said.startswith('delays of 0 to 30 samples')
-
-
-@pytest.mark.parametrize('delay', [0, 4])
-def test_fast_motion_tells_a_delay_between_those_that_err_alike(delay):
-    rng = np.random.default_rng(0)
-    u = 0.5 + 0.1 * rng.standard_normal(800)
-    x = Delay(delay).apply(u) + 1e-3 * rng.standard_normal(u.size)
-    judged = np.arange(u.size) > 600
-    found = delay_behind([Excerpt(u, x, ~judged)], [Excerpt(u, x, judged)], np.array([0.3]))
-    assert (found.samples, found.source) == (delay, 'free run')
-    # a delay that noise hides is told by its errors
-    hidden = u + 2.0 * np.diff(u, prepend=u[0]) + rng.standard_normal(u.size)
-    said = delay_behind(
-        [Excerpt(u, hidden, ~judged)], [Excerpt(u, hidden, judged)], np.array([0.3])
-    )
-    assert '% of stroke' in said

@@ -8,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 from paper_stage import PAPER
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.free_run_fit import fit_free_run
-from piezo_ident.identification.prepare import prepare
-from piezo_ident.identification.results import Settings, silent
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.record.record import Piece, Record, records_of
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.identification import facts
 import pytest
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
@@ -29,11 +32,6 @@ def record_of(v, noise=1e-5, memory=None, name='record'):
     y = STAGE.stream(memory).process(v)
     y = y + noise * 75e-6 * np.random.default_rng(0).standard_normal(v.size)
     return Record((Piece(v, y, FS),), name)
-
-
-def identify(records, settings=None):
-    data = prepare(records_of(records, 'identify'))
-    return fit_free_run(data.runs, data.rate, data.scaling, settings or Settings(), silent)
 
 
 def sine(seconds, f=2.0, phase=0.0):
@@ -89,6 +87,16 @@ def test_a_given_delay_is_taken_and_too_little_is_refused():
         identify(flat, Settings(hold_out=0.21))
 
 
+def test_steps_alone_do_not_identify_hysteresis():
+    stage = SimulatedStage.load('paper')
+    text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.1, count: 40}'
+    played = stage.play(parse_program(text).build(20000.0), np.random.default_rng(1))
+    steps = played.find('step')[0]
+    record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
+    missing = dict(identify(record).not_identified)
+    assert 'triangle' in missing['hysteresis']
+
+
 def test_several_records_are_all_fitted_each_with_its_own_zero():
     def record(name, v, zero, seed):
         y = STAGE.stream(None).process(v) + zero
@@ -99,9 +107,26 @@ def test_several_records_are_all_fitted_each_with_its_own_zero():
     two = record('two', 0.8 * sine(3.0, f=5.0), 4e-6, 1)
     result = identify([one, two])
     # the zero that moved is no error of the model
-    zero = result.offsets['two', 0.0]
-    assert zero == pytest.approx(4e-6, rel=0.02)
+    of = {row.record: row for row in result.errors if row.data == 'fitted'}
+    assert set(of) == {'one', 'two'}
+    assert max(row.percent for row in result.errors) < 0.5
     assert any('two: its zero of displacement' in said for said in result.warnings)
+
+
+def test_a_multisine_does_not_only_jump():
+    t = np.arange(int(3.0 * FS)) / FS
+    rng = np.random.default_rng(3)
+    tones = [
+        np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.3)) for f in np.arange(40.0, 1200.0, 9)
+    ]
+    v = np.sum(tones, axis=0)
+    v = 5.0 + 4.5 * v / np.abs(v).max()
+    result = identify(Record((Piece(v, STAGE.simulate(v), FS),), 'multisine'))
+    assert 'hysteresis' not in dict(result.not_identified)
+    assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
+    # the frequency response is measured without a segment called noise
+    measured = result.dynamics.response
+    assert 600 < measured.frequency[np.argmax(np.abs(measured.response))] < 800
 
 
 def test_the_only_chirp_is_not_held_out():
@@ -129,3 +154,37 @@ def test_what_chooses_lies_within_what_is_fitted():
     assert any(abs(mode.frequency / 700 - 1) < 0.03 for mode in result.model.dynamics.modes(FS))
     unseen = STAGE.simulate(v := sine(2.0, 3.0))
     assert np.std(result.model.simulate(v) - unseen) < 2e-3 * np.ptp(unseen)
+
+
+def slow_record(delay, n=800):
+    """Return a sine of 1 Hz and varying size at 200 Hz through plays and a pure delay."""
+    t = np.arange(n) / 200.0
+    v = 1.8 - 1.75 * np.cos(2 * np.pi * t) * (0.55 + 0.45 * np.cos(2 * np.pi * t / 8))
+    H = Hysteresis(np.arange(1, 8) / 8.0, np.full(7, 0.12), 0.1, 1.0)
+    y = Delay(delay).apply(H((v - v.min()) / np.ptp(v)))
+    y = y + 1e-3 * np.random.default_rng(0).standard_normal(n)
+    return Record.from_arrays(v, 1e-5 * y, sample_rate=200, name='slow')
+
+
+@pytest.mark.parametrize('delay', [0, 7])
+def test_a_given_delay_is_used_and_labelled_even_where_another_errs_less(delay):
+    result = identify(slow_record(3), Settings(delay=delay, thresholds=6))
+    assert (result.delay.samples, result.delay.source) == (delay, 'given')
+    assert result.model.delay.total == delay
+    assert 'delay' not in dict(result.not_identified)
+    assert result.model.identification['delay_source'] == 'given'
+    # nobody measured how far off it is
+    assert result.model.identification['uncertainties']['delay'] is None
+    assert dict(facts(result))['delay'].startswith(f'{delay} samples (given)')
+
+
+def test_a_given_delay_of_most_of_the_record_is_refused():
+    with pytest.raises(IdentificationError, match='--delay'):
+        identify(slow_record(3), Settings(delay=500))
+
+
+def test_slow_motion_of_many_sizes_tells_a_long_delay():
+    result = identify(slow_record(3))
+    assert (result.delay.samples, result.delay.source) == (3, 'free run')
+    assert result.model.delay.total == 3
+    assert list(dict(result.not_identified)) == ['dynamics']

@@ -9,15 +9,13 @@ import itertools
 import numpy as np
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.prepare import Excerpt, Run
-from piezo_ident.identification.results import DelayResult, Settings
-from piezo_ident.identification.starts import fit_starts, without_harm
-from piezo_ident.identification.warnings import warn_of_starts
+from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.results import Settings
+from piezo_ident.identification.starts import fit_starts
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.play import play_columns
-from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.record import Record
 import pytest
 
 N = 24
@@ -112,31 +110,3 @@ def test_labelled_programme_from_zero_volts_is_worth_as_much(rest):
     v = 55.0 - 75.0 * np.cos(2.0 * np.pi * 5.0 * np.arange(8000) / 20_000.0)
     unseen = Record.from_arrays(v, stage.model.simulate(v), sample_rate=20_000.0)
     assert free_run(model, unseen).errors.percent_without_offset < 0.3
-
-
-@pytest.mark.parametrize(
-    ('moved', 'way', 'counts'),
-    [
-        (0.0, [0.5, 1.0, 0.0, 1.0, 0.2, 0.8, 0.0], True),
-        (0.03, [0.5, 1.0, 0.0, 1.0, 0.2, 0.8, 0.0], False),
-        # one falling branch is no loop: without its start H would be anything
-        (0.03, [0.5, 1.0, 0.0], True),
-    ],
-)
-def test_a_start_that_no_memory_describes_is_left_out(moved, way, counts):
-    noise = 0.5 + 0.02 * np.random.default_rng(1).standard_normal(2000)
-    u = np.concatenate([noise, corners(way, 700)])
-    turned = noise.size + 700 * (2 if len(way) > 3 else 1)
-    x = relays(np.concatenate([BEFORE, u]))[BEFORE.size :]
-    x[: noise.size] += moved
-    use = np.ones(u.size, dtype=bool)
-    known = np.arange(u.size) > turned
-    piece = Piece(u, x, 1e3)
-    run = Run(u=u, x=x, use=use, record='r', piece=piece, known=known)
-    [rule] = fit_starts([Excerpt(u, x, use & (np.arange(u.size) >= noise.size))], [True])
-    excerpts = [Excerpt(u, x, use, rule)]
-    [after], [kept] = without_harm([run], excerpts, Dynamics.unit(), DelayResult(0, 0.0, 'given'))
-    assert kept.use[: noise.size].all() == counts
-    assert kept.use[turned + 1 :].all()
-    [*said] = warn_of_starts([run], [after])
-    assert bool(said) != counts
