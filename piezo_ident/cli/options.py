@@ -241,7 +241,7 @@ IDENTIFY = [
     _option('--order', _order, 'NA,NB', 'Of G (default: searched).'),
     _option('--max-order', _whole, 'N', 'Of the search (default: 15).'),
     _option('--delay', _whole, 'SAMPLES', 'Delay (default: identified).'),
-    _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is not fitted.'),
+    _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is held out.'),
     _option('--solver', click.Choice(['least_squares', 'swarm']), None, 'Of the weights.'),
     _flag('--polish', 'Let least squares finish what the swarm found.'),
     _option('--seed', _whole, 'N', 'Of the swarm (default: 0).'),
