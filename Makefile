@@ -23,21 +23,21 @@ MADE := .venv/.made$(if $(SOURCED),-sourced)
 demo: .venv/.demo
 	.venv/bin/python examples/demo.py --out demo_report
 
-# the tests that mostly compute, those of node processes with mypy beside them, then what judges
-# seconds, one after the other; a file stays in one process, the slowest file starts first; what
-# another program's burst made fail is asked once more, alone
-PARALLEL := --dist loadfile --no-loadscope-reorder
+# the tests that mostly compute, with mypy beside them, those of node processes, then, one after the
+# other, what loads the machine and what judges seconds; a file stays in one process, the slowest
+# file starts first; what another program's burst made fail is asked once more, alone
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder -m 'not timed and not loads'
+ALONE := -m 'timed or loads'
 AGAIN := --last-failed --last-failed-no-failures none
 
 test: .venv/.test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/pytest -n 2 $(PARALLEL) -m 'not timed' --ignore=test/nodes $(PYTEST_ARGS)
 	.venv/bin/mypy & types=$$!; \
-	.venv/bin/pytest -n 3 $(PARALLEL) -m 'not timed' test/nodes $(PYTEST_ARGS) || \
-	.venv/bin/pytest $(AGAIN) -m 'not timed' test/nodes $(PYTEST_ARGS); rc=$$?; \
-	wait $$types && exit $$rc
-	.venv/bin/pytest -m timed $(PYTEST_ARGS) || .venv/bin/pytest $(AGAIN) -m timed $(PYTEST_ARGS)
+	.venv/bin/pytest $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS); rc=$$?; wait $$types && exit $$rc
+	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
+	.venv/bin/pytest $(AGAIN) -m 'not timed and not loads' test/nodes $(PYTEST_ARGS)
+	.venv/bin/pytest $(ALONE) $(PYTEST_ARGS) || .venv/bin/pytest $(AGAIN) $(ALONE) $(PYTEST_ARGS)
 
 lint: .venv/.test
 	.venv/bin/ruff check .

@@ -16,6 +16,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+pytestmark = pytest.mark.loads
+
 
 @pytest.fixture(scope='module')
 def attack():

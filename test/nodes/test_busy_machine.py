@@ -17,6 +17,8 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 import pytest
 from rcl_interfaces.msg import Log
 
+pytestmark = pytest.mark.loads
+
 PROGRAM = """
 limits: [0, 10]
 segments:
