@@ -62,7 +62,7 @@ def seconds(call) -> float:
 
 
 def test_a_bag_that_is_slow_to_open_is_replayed_later(made, monkeypatch, tmp_path):
-    monkeypatch.setattr(player, 'opened_bag', slow)
+    monkeypatch.setattr(player, 'ordered_bag', slow)
     node = made(player.PlayerNode, bag=str(tmp_path))
     assert seconds(node.start) < AT_ONCE
     assert seconds(node.stop) < AT_ONCE
