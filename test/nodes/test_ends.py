@@ -55,7 +55,6 @@ def test_in_the_middle_of_everything(tmp_path):
 
 
 def in_the_middle(record, tmp_path):
-    tmp_path.mkdir()
     write_bag(record, tmp_path / 'old')
     (tmp_path / 'model.yaml').write_text(paper())
     with Graph() as g:
