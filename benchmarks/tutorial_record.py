@@ -56,15 +56,16 @@ PROGRAMS = {
         """
 - {signal: idle, duration: 0.3}
 - {signal: hold, level: 35, duration: 0.3}
-- {signal: triangle, base: 35, peaks: [65, 65, 65], slope: 200}
+- {signal: triangle, base: 35, peaks: [65, 65, 65, 65, 65, 65, 65, 65], slope: 3000}
 - {signal: hold, level: 80, duration: 0.9}
 """,
     ),
 }
 
 
-def stage() -> Stage:
-    """Return the stage."""
+def stage(record: str) -> Stage:
+    """Return the stage; behind the calibration its amplifier is one of less current."""
+    slew = {} if record == 'identification' else {'slew_limit': 20.0}
     return Stage(
         core=make_core('preisach', np.random.default_rng(21)),
         linear=Linear(((210.0, 0.05, 0.9), (460.0, 0.03, 0.1)), 700.0, 1.3 / RATE),
@@ -74,8 +75,8 @@ def stage() -> Stage:
         offset=3.2e-6,
         noise='1/f',
         noise_rms=5e-5,
-        gains={'creep': 0.006},
-        variants={'creep': 1},
+        gains={'creep': 0.006, **slew},
+        variants={'creep': 1, **dict.fromkeys(slew, 0)},
         seed=7,
     )
 
@@ -84,7 +85,7 @@ def table(name: str) -> str:
     """Return one record as the text of a csv file."""
     record, signals = PROGRAMS[name]
     v = parse_program(HEAD + signals).build().v
-    y = stage().respond(v, record)
+    y = stage(record).respond(v, record)
     lines = [
         f'{k / RATE:.4f},{a:.3f},{1e6 * b:.3f}' for k, (a, b) in enumerate(zip(v, y, strict=True))
     ]

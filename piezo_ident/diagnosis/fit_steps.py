@@ -16,10 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import centred, Rows
-from scipy.optimize import lsq_linear
+from piezo_ident.fitting.equations import bounded_step
 
 #: factor of the damping after a step that failed; its square after the next one, and so on
 WORSE = 3.0
@@ -81,7 +80,7 @@ class Scale:
 
 
 class FitStep:
-    """Normal equations of a step, scaled to columns of length one."""
+    """Normal equations of a step."""
 
     def __init__(
         self, base: BaseColumns, moving: Array, e: Array, prior: Array, pull: Pull | None = None
@@ -91,38 +90,15 @@ class FitStep:
         b = np.concatenate([mixed[:, -1], own[:-1, -1]])
         if pull is not None:
             A, b = A + pull.A, b + pull.b
-        size = np.sqrt(np.diag(A))
-        self._size = np.where(size > 0.0, size, 1.0)
-        self._plain = A / np.outer(self._size, self._size)
-        self._A = self._plain.copy()
-        self._A[np.diag_indices_from(self._A)] += 1e-10 + prior / self._size**2
-        # a column of zeros stays where it is
-        self._A[np.diag_indices_from(self._A)] += np.where(size > 0.0, 0.0, 1.0)
-        self._b = b / self._size
+        self._A, self._b, self._prior = A, b, prior
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Return the bounded step; damping is a share of each column's own energy."""
-        A = self._A.copy()
-        A[np.diag_indices_from(A)] += damping
-        wide = upper > lower
-        x = np.zeros(self._size.size)
-        bounds = ((lower * self._size)[wide], (upper * self._size)[wide])
-        try:
-            L = np.linalg.cholesky(A)
-            # what stays where it is adds nothing to the right-hand side
-            target = np.linalg.solve(L, self._b)
-            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise IdentificationError(
-                f'the joint fit is singular ({error}): its parameters do not follow from these '
-                'data; are all values of a plausible size?'
-            ) from None
-        return np.clip(x / self._size, lower, upper)
+        return bounded_step(self._A, self._b, self._prior, lower, upper, damping)
 
     def gain(self, delta: Array) -> float:
         """Return by how much a step lowers the sum of squares, were the model linear."""
-        x = delta * self._size
-        return float(x @ (2.0 * self._b - self._plain @ x))
+        return float(delta @ (2.0 * self._b - self._A @ delta))
 
 
 def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:

@@ -87,7 +87,11 @@ def bounded_step(
         L = np.linalg.cholesky(scaled)
         target = np.linalg.solve(L, b / size)
         bounds = ((lower * size)[wide], (upper * size)[wide])
-        x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        with np.errstate(divide='ignore', invalid='ignore'):
+            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
+        if not np.isfinite(x).all():
+            # an active set that is a rounding error away from its bound divides by zero
+            x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='trf').x
     except (np.linalg.LinAlgError, ValueError) as error:
         raise IdentificationError(
             f'the free-run fit is singular ({error}): its parameters do not follow from these '

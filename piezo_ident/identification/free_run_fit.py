@@ -32,7 +32,7 @@ from piezo_ident.identification.results import (
     Progress,
     Settings,
 )
-from piezo_ident.identification.spectra import broadband_response, excited_band
+from piezo_ident.identification.spectra import broadband_response, excited_band, highest_frequency
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     factorise,
@@ -225,7 +225,7 @@ def _outcome(
         excited_band(run.u[run.use] - run.u[run.use].mean(), rate, depth=1e-4) for run in chosen
     )
     delay = _delay_result(fits, settings, rate, band)
-    missing = _missing(fits, delay, band)
+    missing = _missing(fits, delay, rate, band)
     names = ', '.join(_named(run, mask) for run, mask in zip(chosen, parts, strict=True))
     warnings = [
         'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
@@ -375,8 +375,8 @@ def _dynamics_result(fits: _Fits, rate: float, band: float) -> DynamicsResult:
     )
 
 
-def _missing(fits: _Fits, delay: DelayResult, band: float) -> dict[str, str]:
-    """Return what stayed at its neutral value, and why."""
+def _missing(fits: _Fits, delay: DelayResult, rate: float, band: float) -> dict[str, str]:
+    """Return what these data do not tell, and why."""
     missing = {}
     if delay.source == 'none':
         missing['delay'] = 'no delay errs less on held-out motion than none; add steps or noise'
@@ -385,6 +385,14 @@ def _missing(fits: _Fits, delay: DelayResult, band: float) -> dict[str, str]:
             'no order of G errs clearly less on held-out motion than the hysteresis and a pure '
             f'delay (the voltage moves up to {band:.3g} Hz); add steps or noise'
         )
+    elif modes := fits.last.stage.dynamics.modes(rate):
+        lowest = min(mode.frequency for mode in modes)
+        reach = max(highest_frequency(run.u, rate) for run in fits.chosen)
+        if reach < lowest:
+            missing['dynamics'] = (
+                f'the voltage moves up to {reach:.3g} Hz, and the lowest mode of G lies at '
+                f'{lowest:.3g} Hz, where nothing was seen of it; add steps or noise'
+            )
     if reason := only_jumps(fits.chosen):
         missing['hysteresis'] = reason
     return missing

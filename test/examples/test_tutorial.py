@@ -49,7 +49,7 @@ def test_the_notebook_runs(tutorial, tmp_path):
     # results and pictures show themselves, and the story is that of the page
     assert sum('image/png' in data for data in shown) >= 5
     (verdict,) = (d['text/plain'] for d in shown if 'verdict' in d.get('text/plain', ''))
-    assert verdict.startswith('Creep explains')
+    assert verdict.startswith('Slew limit explains')
     (printed,) = (o['text'] for o in outputs if ' before, ' in o.get('text', ''))
     before, after = float(printed.split()[0]), float(printed.split()[5])
     assert before > 0.5 and after < 0.1

@@ -114,7 +114,7 @@ def test_several_records_are_all_fitted_each_with_its_own_zero():
 
 
 def test_a_multisine_does_not_only_jump():
-    t = np.arange(int(2.0 * FS)) / FS
+    t = np.arange(int(3.0 * FS)) / FS
     rng = np.random.default_rng(3)
     tones = [
         np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.3)) for f in np.arange(40.0, 1200.0, 9)
