@@ -289,8 +289,12 @@ def test_of_two_of_one_name_that_start_at_once_one_drives_at_most():
 
         # one of them where it has heard the other before its own first block, else both
         g.wait(given_way, 'one to give way')
-        failed = [s for s in g.statuses('excitation') if s['state'] == 'failed']
-        assert failed and all('end it first' in s['text'] for s in failed)
+
+        def failed():
+            return [s for s in g.statuses('excitation') if s['state'] == 'failed']
+
+        g.wait(failed, 'its status')
+        assert all('end it first' in s['text'] for s in failed())
         if applied:
             assert np.abs(np.diff(column(applied)[1])).max() * FS <= 40_000.0 * (1 + 1e-9)
 
