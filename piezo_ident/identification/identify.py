@@ -97,8 +97,8 @@ def identify(
     ----------
     records : sequence of Record, or Record
         With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
-        of other kinds are then left for validation.  Without them every run is fitted as a
-        whole, but for its end.
+        of other kinds are then left for validation.  Without them every run is fitted in one
+        go, but for what is held out.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
         Records that are neither fitted nor looked at; the headline is about them.

@@ -295,21 +295,20 @@ def third_step(
     settings: Settings,
     progress: Progress,
     whole: Sequence[Excerpt] | None = None,
-    plays: bool = False,
     others: Sequence[Excerpt] = (),
 ) -> HysteresisFit:
     """
     Find H: law and thresholds by held-out error unless their number is given, then the weights.
 
     `fit` and `held` are the same runs in the same order with the fitted and the held-out samples;
-    `whole` is what the weights are fitted to in the end, `fit` when absent.  `plays` says that H
-    has to be a sum of plays; `others` is small motion, which can speak against a wider law.
+    `whole` is what the weights are fitted to in the end, `fit` when absent; `others` is small
+    motion, which can speak against a wider law.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit
     swing = max(e.swing for e in fitted)
     choice = Choice(None)
-    if settings.thresholds is None and settings.solver == 'least_squares' and not plays:
+    if settings.thresholds is None and settings.solver == 'least_squares':
         choice = choose_law(
             fitted, G, delay, lambda share: progress('hysteresis', 0.2 * share), others
         )
