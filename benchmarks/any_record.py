@@ -347,14 +347,10 @@ def main() -> None:
     with ProcessPoolExecutor(2) as pool:
         for row in pool.map(judge, *zip(*cases, strict=True)):
             rows.append(row)
-            both = ', '.join(
-                f'{x:.3g} ({ratio:.2f}, {spent:.0f} s)'
-                for x, ratio, spent in zip(row.ways, row.ratios, row.seconds, strict=True)
-            )
             peers = ' '.join(f'{x:.3g}' for x in row.peers)
             print(
-                f'{len(rows)}/{len(cases)} {row.law}, {row.kind}, seed {row.seed}: {both}; '
-                f'peers {peers}',
+                f'{len(rows)}/{len(cases)} {row.law}, {row.kind}, seed {row.seed}: {row.own:.3g} '
+                f'({row.ratio:.2f}, {row.seconds:.0f} s); peers {peers}',
                 flush=True,
             )
     given.out.parent.mkdir(parents=True, exist_ok=True)
