@@ -19,10 +19,12 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report.diagnosis import diagnosis_text
 from piezo_ident.report.to_json import to_json
+from programs import slow_model
 import pytest
 import truths
 
-RATE = 20_000.0
+#: shows all that the programs of the truths move
+RATE = 5000.0
 PATH = DiagnosisSettings(
     effects=(
         'saturation',
@@ -46,15 +48,20 @@ def stage():
     more = slice(law.thresholds.size, law.densities)
     coefficients[more] = np.random.default_rng(0).uniform(0.0, 0.03, coefficients[more].size)
     coefficients[-3] = 0.7
-    return replace(model, hysteresis=law.hysteresis(coefficients))
+    return replace(
+        model,
+        sample_rate=RATE,
+        hysteresis=law.hysteresis(coefficients),
+        dynamics=slow_model().dynamics,
+    )
 
 
 def record(real, kind='diagnosis', *, labelled=True, factor=1.0):
-    """Return what a stage does in a program of the truths, with some noise."""
-    _, v, labels = truths.program(kind, 2)
+    """Return what a stage does in a program of the truths, with the noise of 2e-4 at 20 kHz."""
+    _, v, labels = truths.program(kind, 2, RATE)
     v = v * stage().scaling.range[1] / v.max()
     y = factor * real.simulate(v)
-    y = y + np.random.default_rng(len(kind)).normal(0.0, 2e-4 * np.ptp(y), y.size)
+    y = y + np.random.default_rng(len(kind)).normal(0.0, 1e-4 * np.ptp(y), y.size)
     segments = tuple(Segment(*label) for label in labels) if labelled else ()
     return Record((Piece(v, y, RATE, segments=segments),), kind)
 
