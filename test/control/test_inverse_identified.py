@@ -38,7 +38,8 @@ segments:
 
 @pytest.fixture(scope='module')
 def record():
-    program = parse_program(identification_program())
+    text = identification_program(slew=100, steps=8, cycles=8, noise=0.5, slope=60)
+    program = parse_program(text)
     return STAGE.play(program, np.random.default_rng(0))
 
 

@@ -79,7 +79,8 @@ def assert_equal(a: Record, b: Record) -> None:
 
 
 @settings(
-    max_examples=15,
+    # one .mat costs a process
+    max_examples=8,
     deadline=None,
     # shrinking files takes minutes and finds nothing that the message does not say
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
