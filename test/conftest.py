@@ -27,6 +27,11 @@ SLOWEST = (
     'examples/test_demo.py',
     'identification/test_identify.py',
 )
+#: a PNG of one white pixel
+BLANK = bytes.fromhex(
+    '89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55'
+    '0000000a4944415478da63f80f00010101001cb08c990000000049454e44ae426082'
+)
 #: share of the processors that others may take beside tests that judge seconds
 BUSY = 0.3
 
@@ -52,6 +57,12 @@ def idle_machine():
     busy = 1.0 - idle / max(total, 1)
     if busy > BUSY:
         pytest.skip(f'other programs keep {100 * busy:.0f} % of the processors busy')
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch):
+    """Have pictures laid out for a report and not rendered, where nobody looks at them."""
+    monkeypatch.setattr('piezo_ident.report.figures.style.png', lambda *_: BLANK)
 
 
 @pytest.fixture(autouse=True)

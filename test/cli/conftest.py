@@ -28,6 +28,11 @@ segments:
 """
 
 
+@pytest.fixture(autouse=True)
+def _blank(blank_pictures):
+    """Render no picture of a report: what renders them has tests of its own."""
+
+
 @pytest.fixture(scope='session')
 def made(tmp_path_factory) -> Path:
     """Return a folder with a stage, its record, a record of a sine and the model."""

@@ -55,7 +55,9 @@ def test_the_notebook_runs(tutorial, tmp_path):
     assert before > 0.5 and after < 0.1
 
 
-def test_the_first_commands_of_the_page_run(tutorial, tmp_path, monkeypatch, capsys):
+def test_the_first_commands_of_the_page_run(
+    tutorial, tmp_path, monkeypatch, capsys, blank_pictures
+):
     (block,) = tutorial.code_blocks(tutorial.PAGE.read_text(encoding='utf-8'), 'console')
     unpack, *commands = block.replace('$ ', '').splitlines()
     assert unpack == 'python -m zipfile -e examples/tutorial_data.zip .'

@@ -189,7 +189,7 @@ def test_interrupted_it_keeps_what_is_done_and_leaves_no_process(records, tmp_pa
         assert (out / 'models' / f'{row.stem}.yaml').is_file()
 
 
-def test_the_command_line(records, tmp_path, capsys):
+def test_the_command_line(records, tmp_path, capsys, blank_pictures):
     argv = ['identify', *map(str, records[:2]), '--each', str(tmp_path / 'out'), '--jobs', '1']
     assert main([*argv, '--order', '2,2', '--thresholds', '5', '--reports', '--json']) == 0
     result = json.loads(capsys.readouterr().out)

@@ -136,7 +136,7 @@ def test_names_that_are_no_text(coarse, tmp_path):
     assert '?.csv' in page.read_text(encoding='utf-8')
 
 
-def test_missing_steps_and_pictures_are_listed(unlabelled, coarse, tmp_path):
+def test_missing_steps_and_pictures_are_listed(unlabelled, blank_pictures, tmp_path):
     result = replace(unlabelled, not_identified=(('delay', 'no <step>'),))
     html = pi.write_report(result, tmp_path).read_text(encoding='utf-8')
     assert 'delay: no &lt;step&gt;' in html
@@ -146,7 +146,7 @@ def test_missing_steps_and_pictures_are_listed(unlabelled, coarse, tmp_path):
     assert 'not identified' in Outline(html).cells
 
 
-def test_an_earlier_report_is_replaced_and_other_files_stay(unlabelled, coarse, tmp_path):
+def test_an_earlier_report_is_replaced_and_other_files_stay(unlabelled, blank_pictures, tmp_path):
     for result, old in ((unlabelled, 'orders.png'), (example('none'), 'residual_3.png')):
         folder = tmp_path / old
         folder.mkdir()
@@ -162,7 +162,7 @@ def test_an_earlier_report_is_replaced_and_other_files_stay(unlabelled, coarse, 
 
 
 @pytest.mark.parametrize('name', ['model.yaml', 'errors.png', 'residual_3.png', 'report.html'])
-def test_a_file_of_no_report_stays(coarse, tmp_path, name):
+def test_a_file_of_no_report_stays(blank_pictures, tmp_path, name):
     (tmp_path / name).write_text('mine')
     with pytest.raises(pi.DataError, match=name):
         check_report_folder(tmp_path, Diagnosis)
@@ -172,7 +172,7 @@ def test_a_file_of_no_report_stays(coarse, tmp_path, name):
     assert (tmp_path / name).read_text() == 'mine'
 
 
-def test_a_folder_that_cannot_be_written(coarse, tmp_path):
+def test_a_folder_that_cannot_be_written(blank_pictures, tmp_path):
     taken = tmp_path / 'file'
     taken.write_text('', encoding='utf-8')
     for folder in (taken, taken / 'below'):
@@ -180,7 +180,7 @@ def test_a_folder_that_cannot_be_written(coarse, tmp_path):
             pi.write_report(example('none'), folder)
 
 
-def test_it_can_be_stopped_before_anything_is_written(coarse, tmp_path):
+def test_it_can_be_stopped_before_anything_is_written(blank_pictures, tmp_path):
     def stop(step: str, share: float) -> None:
         if share > 0.5:
             raise pi.Cancelled('stopped')

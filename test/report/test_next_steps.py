@@ -119,7 +119,7 @@ def test_a_model_that_lacks_nothing_is_used():
     assert [line.split()[2] for line in commands(refitted)] == ['new.yaml']
 
 
-def test_the_page_shows_the_commands(tmp_path, identified):
+def test_the_page_shows_the_commands(tmp_path, identified, blank_pictures):
     page = pi.write_report(identified, tmp_path / 'report', prompt=NAMED)
     html = unescape(page.read_text(encoding='utf-8'))
     for line in commands(identified):
