@@ -38,6 +38,7 @@ import yaml
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from nursery import can_copy
 from observer import ENDS, Observer
 from processes import alive, crowd, Handle, in_time, listens, take_domain
 import rclpy
@@ -139,10 +140,29 @@ class Graph(Observer):
         env: Mapping[str, str] | None = None,
     ) -> Handle:
         """
-        Start a node and wait for its first status, unless its end may be what is tested.
+        Start a node and wait for its first status, unless its start or end may be what is tested.
 
+        One that is waited for is a copy of a process that has imported already (see `nursery`).
         A number for a float parameter must be a float; a remap may be ``{'__node': 'other'}``.
         """
+        is_copy = wait and not env and can_copy()
+        handle = self._begin(executable, params, namespace, remaps, env, is_copy=is_copy)
+        if wait:
+            self._heard([handle])
+        else:
+            handle.is_ended = True
+        return handle
+
+    def _begin(
+        self,
+        executable: str,
+        params: Mapping[str, Any] | None = None,
+        namespace: str = '',
+        remaps: Mapping[str, str] | None = None,
+        env: Mapping[str, str] | None = None,
+        *,
+        is_copy: bool,
+    ) -> Handle:
         remaps = dict(remaps or {})
         command = [
             sys.executable,
@@ -160,23 +180,20 @@ class Graph(Observer):
             command += ['--params-file', str(file)]
         name = '/'.join(filter(None, [namespace.strip('/'), remaps.get('__node', executable)]))
         self.follow(name, executable)
-        handle = Handle(self, name, command, self._log_of(name), env)
+        handle = Handle(self, name, command, self._log_of(name), env, is_copy=is_copy)
         self.handles.append(handle)
-        if wait:
-            self._heard([handle])
-        else:
-            handle.is_ended = True
         return handle
 
     def start_all(self, *nodes: tuple[Any, ...]) -> list[Handle]:
         """Start nodes at once, each a tuple of the arguments of `start`; wait for all of them."""
-        handles = [self.start(*arguments, wait=False) for arguments in nodes]
+        handles = [self._begin(*arguments, is_copy=can_copy()) for arguments in nodes]
         self._heard(handles)
         return handles
 
     def restart(self, handle: Handle, meanwhile: Callable[[], None] = lambda: None) -> Handle:
         """Start a node once more, and do something again and again until it has spoken."""
-        new = Handle(self, handle.name, handle.command, self._log_of(handle.name), handle.env)
+        log = self._log_of(handle.name)
+        new = Handle(self, handle.name, handle.command, log, handle.env, is_copy=handle.is_copy)
         self.handles.append(new)
         self._heard([new], meanwhile)
         return new

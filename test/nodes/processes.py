@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import ctypes
 import fcntl
 import os
 from pathlib import Path
@@ -18,10 +17,13 @@ import sys
 import tempfile
 from typing import Any, IO
 
+from nursery import can_copy, Copy, die_with_parent, Nursery
+
 #: what has not happened within this time will not happen [s]; the machine may be busy
 LIMIT = 60.0
 #: domains whose ports are clear of the system's own
 DOMAINS = range(1, 100)
+NURSERY = Nursery()
 
 
 def in_time(took: float, limit: float, what: str) -> None:
@@ -36,7 +38,7 @@ def crowd() -> Iterator[None]:
     idlers = [
         subprocess.Popen(
             [sys.executable, '-S', '-c', 'while True: pass'],
-            preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
+            preexec_fn=die_with_parent if can_copy() else None,
         )
         for _ in range(2 * (os.cpu_count() or 1))
     ]
@@ -60,11 +62,6 @@ def alive(pid: int) -> bool:
         return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
     except OSError:
         return False
-
-
-def _die_with_parent() -> None:
-    # of the thread that starts it: only the main one may, which outlives them all
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
 def take_domain() -> tuple[int, IO[str]]:
@@ -100,7 +97,7 @@ def _shared_memory(pid: int) -> list[Path]:
 
 
 class Handle:
-    """A node process that a `Graph` started."""
+    """A node process that a `Graph` started, as a copy or from its first line on."""
 
     def __init__(
         self,
@@ -109,25 +106,33 @@ class Handle:
         command: Sequence[str],
         log: Path,
         env: Mapping[str, str] | None = None,
+        *,
+        is_copy: bool = False,
     ) -> None:
         self.graph = graph
         self.name = name
         self.command = command
         self.env = env
+        self.is_copy = is_copy
         #: whether its end is the test's doing
         self.is_ended = False
         self._log = log
         self._said = len(graph.statuses(name))
+        environment = {**graph.environment, **(env or {})}
+        self.process: Copy | subprocess.Popen[bytes]
         with log.open('wb') as out:
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                env={**graph.environment, **(env or {})},
-                start_new_session=True,
-                preexec_fn=_die_with_parent if sys.platform == 'linux' else None,
-            )
+            if is_copy:
+                self.process = NURSERY.copy(command, out.fileno(), environment)
+            else:
+                self.process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=subprocess.STDOUT,
+                    env=environment,
+                    start_new_session=True,
+                    preexec_fn=die_with_parent if can_copy() else None,
+                )
 
     @property
     def log(self) -> str:
