@@ -4,12 +4,14 @@
 """Jobs for worker processes, in a module that such a process can import."""
 
 from array import array
+from dataclasses import dataclass
 import os
 import time
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 from piezo_ident.common.errors import DataError
+from piezo_ident.record.options import ReadOptions
 
 
 def numbers(tick):
@@ -57,3 +59,19 @@ class MakeRecord:
 
     def __call__(self, tick):
         return self.snapshot.record()
+
+
+@dataclass(frozen=True)
+class Deadly:
+    """Ends the process that works on one record."""
+
+    verb = 'identify'
+    reading = ReadOptions()
+
+    def __call__(self, record, name):
+        if name == 'stage_2':
+            os._exit(3)
+        # the other jobs need no numerics
+        from programs import slow_model
+
+        return SimpleNamespace(model=slow_model()), {}

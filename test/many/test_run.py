@@ -4,7 +4,7 @@
 """Many records at once: a failure is a row, a stopped run goes on, workers change no number."""
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 from diagnosis_examples import measured
 import numpy as np
@@ -25,7 +24,7 @@ from piezo_ident.many.run import Diagnose, Identify, run_many
 from piezo_ident.many.table import csv_text, Row
 from piezo_ident.model.files import load
 from piezo_ident.model.simulated_stage import Sensor, SimulatedStage
-from piezo_ident.record.options import ReadOptions
+from process_jobs import Deadly
 from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
 
@@ -58,6 +57,22 @@ def folder(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp('result')
 
 
+class Here:
+    """Does the work of a process in this one."""
+
+    def run(self, job):
+        return job(lambda step, share: None)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Start no process where it is not about processes."""
+    monkeypatch.setattr('piezo_ident.many.workers.WorkerProcess', Here)
+
+
 @pytest.fixture(scope='module')
 def rows(records, folder) -> list[Row]:
     return run_many(records, folder, FAST, jobs=2)
@@ -80,7 +95,7 @@ def test_a_record_that_fails_is_a_row_with_its_reason(rows, folder):
     assert not (folder / 'models/stage_3.yaml').exists()
 
 
-def test_a_second_run_does_only_what_failed_or_changed(rows, records, folder):
+def test_a_second_run_does_only_what_failed_or_changed(rows, records, folder, in_this_process):
     models = folder / 'models'
     before = {path.name: path.stat().st_mtime_ns for path in models.iterdir()}
     os.utime(records[0])
@@ -90,7 +105,7 @@ def test_a_second_run_does_only_what_failed_or_changed(rows, records, folder):
     assert csv_text(again) == csv_text(rows)
 
 
-def test_other_settings_do_all_again(rows, records, folder):
+def test_other_settings_do_all_again(rows, records, folder, in_this_process):
     before = (folder / 'models/stage_10.yaml').stat().st_mtime_ns
     other = Identify(replace(FAST.settings, thresholds=4))
     (row,) = run_many(records[2:3], folder, other, jobs=1)
@@ -98,7 +113,7 @@ def test_other_settings_do_all_again(rows, records, folder):
     assert (folder / 'models/stage_10.yaml').stat().st_mtime_ns > before
 
 
-def test_an_older_file_that_takes_the_place_of_another_is_done(records, tmp_path):
+def test_an_older_file_that_takes_the_place_of_another_is_done(records, tmp_path, in_this_process):
     path, out = tmp_path / 'stage_7.npz', tmp_path / 'out'
     path.write_bytes(records[0].read_bytes())
     (wrong,) = run_many([path], out, FAST, jobs=1)
@@ -109,25 +124,8 @@ def test_an_older_file_that_takes_the_place_of_another_is_done(records, tmp_path
     assert right.values['stroke'] > 1.04 * wrong.values['stroke']
 
 
-@dataclass(frozen=True)
-class Deadly:
-    """Ends the process that works on one record."""
-
-    verb = 'identify'
-
-    reading = ReadOptions()
-
-    def __call__(self, record, name):
-        if name == 'stage_2':
-            os._exit(3)
-        return SimpleNamespace(model=stage(70e-6).model), {}
-
-
-def test_a_process_that_dies_costs_one_record(records, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    import test_run as importable
-
-    done = run_many(records[:3], tmp_path / 'out', importable.Deadly(), jobs=2)
+def test_a_process_that_dies_costs_one_record(records, tmp_path):
+    done = run_many(records[:3], tmp_path / 'out', Deadly(), jobs=2)
     assert [row.record for row in done if row.is_good] == ['stage_1', 'stage_10']
 
 
@@ -146,7 +144,7 @@ def test_places_that_are_refused(records, rows, folder, tmp_path):
         run_many([*records, twin], tmp_path / 'new', FAST)
 
 
-def test_diagnosis_with_a_model_for_each(tmp_path):
+def test_diagnosis_with_a_model_for_each(tmp_path, in_this_process):
     (tmp_path / 'records').mkdir()
     (tmp_path / 'given').mkdir()
     record = measured()
@@ -189,7 +187,7 @@ def test_interrupted_it_keeps_what_is_done_and_leaves_no_process(records, tmp_pa
         assert (out / 'models' / f'{row.stem}.yaml').is_file()
 
 
-def test_the_command_line(records, tmp_path, capsys, blank_pictures):
+def test_the_command_line(records, tmp_path, capsys, blank_pictures, in_this_process):
     argv = ['identify', *map(str, records[:2]), '--each', str(tmp_path / 'out'), '--jobs', '1']
     assert main([*argv, '--order', '2,2', '--thresholds', '5', '--reports', '--json']) == 0
     result = json.loads(capsys.readouterr().out)
@@ -209,7 +207,7 @@ def test_options_that_do_not_go_with_each(records, tmp_path, options):
     assert main(['identify', str(records[0]), '--each', str(tmp_path / 'o'), *options]) == 2
 
 
-def test_a_cluster_gives_the_same_table(records, tmp_path):
+def test_a_cluster_gives_the_same_table(records, tmp_path, in_this_process):
     distributed = pytest.importorskip('distributed')
     cluster = distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address=None, processes=False
