@@ -21,11 +21,20 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 #: files that take longest, the slowest first: they start first, and short ones fill up the end
 SLOWEST = (
     'diagnosis/test_diagnose.py',
-    'diagnosis/test_two_effects.py',
-    'test_site.py',
-    'examples/test_tutorial.py',
-    'examples/test_demo.py',
     'identification/test_identify.py',
+    'diagnosis/test_conclusion.py',
+    'diagnosis/test_two_effects.py',
+    'examples/test_tutorial.py',
+    'identification/test_free_run_fit.py',
+    'examples/test_demo.py',
+    'control/test_inverse_identified.py',
+    'test_site.py',
+    'nodes/test_diagnose_node.py',
+    'nodes/test_run_faults.py',
+    'nodes/test_whole_graph.py',
+    'nodes/test_identifier_node.py',
+    'nodes/test_driver_example.py',
+    'nodes/test_faults.py',
 )
 #: a PNG of one white pixel
 BLANK = bytes.fromhex(
