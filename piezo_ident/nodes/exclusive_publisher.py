@@ -11,13 +11,14 @@ hears more messages than it has sent hears somebody else.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import threading
 import time
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.nodes.subscriptions import between_turns, unspun
-from piezo_ident.nodes.wire import publishers, STREAM, to_message
+from piezo_ident.nodes.wire import publishers, STREAM, to_message, UNNAMED
 from piezo_ident.record.blocks import Samples
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -81,7 +82,8 @@ class ExclusivePublisher:
         ConfigError
             When any other publisher is to be refused, and there is one.
         """
-        self._refuse_others()
+        # who has no name yet may have the same one
+        self._refuse(name for name in self.others() if name != UNNAMED)
         self.stop_listening()
         self._begin, self._met, self._free = time.monotonic(), 0.0, 0.0
         self._sent = self._heard = 0
@@ -105,9 +107,10 @@ class ExclusivePublisher:
         if not self._met:
             self._await_publishers(now)
             return False
-        if now < self._met + LISTEN:
+        others = self.others()
+        if now < self._met + LISTEN + (MEET if UNNAMED in others else 0.0):
             return False
-        self._refuse_others()
+        self._refuse(others)
         # without our own listener
         count = self._publisher.get_subscription_count() - 1
         if count < subscribers:
@@ -158,10 +161,10 @@ class ExclusivePublisher:
         if now > begin and (is_matched or now > begin + MEET):
             self._met = now
 
-    def _refuse_others(self) -> None:
-        if self._stays and (names := self.others()):
+    def _refuse(self, names: Iterable[str]) -> None:
+        if self._stays and (name := next(iter(names), '')):
             raise ConfigError(
-                f'{names[0]} publishes on {self.topic} too; end it first: '
+                f'{name} publishes on {self.topic} too; end it first: '
                 'two programs at once would tear the stage to and fro'
             )
 
@@ -178,7 +181,8 @@ class ExclusivePublisher:
     def second(self) -> str:
         """Return a publisher that came since the right was given, empty without one."""
         now = publishers(self._node, self.topic) if self._free else {}
-        return min((name for gid, name in now.items() if gid not in self._known), default='')
+        new = (name for gid, name in now.items() if gid not in self._known)
+        return min((name for name in new if name != UNNAMED), default='')
 
     def stop_listening(self) -> None:
         """Drop the listener, between two turns of the executor: it gets all that is sent here."""

@@ -16,6 +16,8 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 #: most samples of a block, and characters of a label
 MOST, LONGEST = 100_000, 200
+#: a node that the middleware has not told of yet
+UNNAMED = 'a node without a name'
 
 #: samples: reliable, the last five seconds of blocks, on both sides: a reader that gets no time
 #: from the machine meanwhile misses none
@@ -85,10 +87,16 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
 
 
 def publishers(node: Node, topic: str) -> dict[bytes, str]:
-    """Return the full name of the node of each publisher of a topic by the publisher's gid."""
+    """
+    Return the full name of the node of each publisher of a topic by the publisher's gid.
+
+    The middleware may hear of a publisher before it hears of its node: that one is `UNNAMED`.
+    """
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     return {
-        bytes(info.endpoint_gid): f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+        bytes(info.endpoint_gid): UNNAMED
+        if info.node_name == '_NODE_NAME_UNKNOWN_'
+        else f'{info.node_namespace.rstrip("/")}/{info.node_name}'
         for info in infos
     }
 

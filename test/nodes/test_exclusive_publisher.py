@@ -13,6 +13,7 @@ import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.nodes import exclusive_publisher
 from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
+from piezo_ident.nodes.wire import UNNAMED
 from piezo_ident.record.blocks import Samples
 from processes import LIMIT, take_domain
 import rclpy
@@ -93,6 +94,28 @@ def test_two_that_start_at_the_same_moment_hear_each_other(made, names, stays):
     for output in outputs:
         output.send(BLOCK)
         output.refuse_foreign_blocks()
+
+
+def test_one_whose_name_is_not_told_yet_is_refused_once_it_has_another(made, monkeypatch):
+    (output,) = made('one', stays=True)
+    told = {b'?': UNNAMED}
+    monkeypatch.setattr(exclusive_publisher, 'publishers', lambda *_: told)
+    output.open()
+    for _ in range(2):
+        assert not output.poll(0, 10.0)
+        time.sleep(exclusive_publisher.LISTEN)
+    assert output.second() == ''
+    told[b'?'] = '/two'
+    with pytest.raises(ConfigError, match='/two publishes on /voltage too'):
+        until(lambda: output.poll(0, 10.0))
+    with pytest.raises(ConfigError, match='/two'):
+        output.open()
+    # one that stays without a name is no namesake that was killed
+    told[b'?'] = '/one'
+    output.open()
+    told[b'?'] = UNNAMED
+    with pytest.raises(ConfigError, match=UNNAMED):
+        until(lambda: output.poll(0, 10.0))
 
 
 def test_one_that_comes_later_under_the_same_name_is_refused_and_known(made):
