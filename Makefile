@@ -27,7 +27,7 @@ demo: .venv/.demo
 # other, what loads the machine and what judges seconds; a file stays in one process, the slowest
 # file starts first; what another program's burst made fail is asked once more, alone
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder -m 'not timed and not loads'
-ALONE := -m 'timed or loads'
+ALONE := -m 'timed or loads' test/nodes
 AGAIN := --last-failed --last-failed-no-failures none
 
 test: .venv/.test

@@ -46,6 +46,13 @@ BUSY = 0.3
 
 
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if 'nodes' not in item.path.parts and {'timed', 'loads'} & {
+            m.name for m in item.iter_markers()
+        }:
+            raise pytest.UsageError(
+                f'{item.nodeid}: make test runs such tests of test/nodes alone'
+            )
     order = {Path(__file__).parent / name: i for i, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path, len(order)))
 

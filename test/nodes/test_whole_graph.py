@@ -375,16 +375,19 @@ def test_every_yaml_file_loads_into_its_running_node():
 
 
 @pytest.mark.timed
-def test_a_signal_ends_what_is_at_rest(whole):
-
-    for node in NODES:
-        if whole.handle(node).process.poll() is not None:
-            whole.restart(whole.handle(node))
-    begin = time.monotonic()
-    for node in NODES:
-        whole.handle(node).send(signal.SIGTERM)
-    for node in NODES:
-        handle = whole.handle(node)
-        assert handle.process.wait(60) == 0, (node, handle.log)
-        assert not handle.complaints, node
-    in_time(time.monotonic() - begin, 2.0, 'the end of all nodes at rest')
+def test_a_signal_ends_what_is_at_rest():
+    with Graph() as g:
+        g.start_all(*((node,) for node in NODES))
+        assert g.set('excitation', 'program', HIGH)[0]
+        assert g.call('excitation/start')[0]
+        g.until('excitation', 'running')
+        assert g.finish('excitation/stop', 'stopped')['state'] == 'stopped'
+        g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+        begin = time.monotonic()
+        for node in NODES:
+            g.handle(node).send(signal.SIGTERM)
+        for node in NODES:
+            handle = g.handle(node)
+            assert handle.process.wait(60) == 0, (node, handle.log)
+            assert not handle.complaints, node
+        in_time(time.monotonic() - begin, 2.0, 'the end of all nodes at rest')
