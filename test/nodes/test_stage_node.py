@@ -159,6 +159,8 @@ def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab, rest, ramp_slew)
     try:
         lab.wait(lambda: got[-1].values[-1] == rest, 'rest')
         idle(lab)
+        # with another rest the stage ramps once more
+        ended = got[applied:]
     finally:
         assert lab.set('stage', 'rest', 0.0)[0]
         assert lab.set('stage', 'ramp_slew', 20.0)[0]
@@ -166,8 +168,8 @@ def test_a_stream_joins_by_a_ramp_and_silence_ends_at_rest(lab, rest, ramp_slew)
     assert next(s['state'] for s in said if s['state'] != 'running') == 'ramping'
     assert any('ramping to rest' in s['text'] and s['level'] == '1' for s in said)
     # t goes on, at 20 V/s at its steepest
-    ramp = [b for b in got[applied:] if b.segment == 'ramp:silence']
-    t, v = column(got[applied:])
+    ramp = [b for b in ended if b.segment == 'ramp:silence']
+    t, v = column(ended)
     assert np.array_equal(np.rint(t * FS), np.arange(t.size))
     assert np.abs(np.diff(v)).max() * FS == pytest.approx(ramp_slew, rel=1e-3)
     down = column(ramp)[1]
