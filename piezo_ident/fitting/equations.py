@@ -45,16 +45,16 @@ class Equations:
         Return the sum of squares of every block, predicted from the other sets; shape (n_b,).
 
         Blocks of one number in `sets`, shape (n_b,), are left out together, those of -1 never.
-        The prior, shape (p,), is a weight on the diagonal; bounds are those of the step.
+        The prior, shape (p, p), is what is known of the step before; bounds are those of the step.
         """
-        A, b = self.A.sum(axis=0), self.b.sum(axis=0)
-        errors = self.s.copy()
+        A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
+        errors, none = self.s.copy(), np.zeros(b.size)
         for one in np.unique(sets[sets >= 0]):
             out = sets == one
             if out.all():
                 continue
             A_out, b_out = self.A[out], self.b[out]
-            theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), prior, lower, upper)
+            theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), none, lower, upper)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
         return np.asarray(np.maximum(errors, 0.0))
 

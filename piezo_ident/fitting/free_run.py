@@ -62,7 +62,7 @@ class Fit:
         return float(np.sqrt(self.loss / max(self.n, 1)))
 
     def prior_weight(self) -> Array:
-        """Return the weight of the prior on the diagonal of the equations, shape (p,)."""
+        """Return what the prior adds to the equations, shape (p, p)."""
         return _prior_weight(self.stage, self.loss, self.equations.rows)
 
     def held_out(self, sets: Integers) -> Array:
@@ -122,16 +122,18 @@ def fit(
             'plausible size?'
         )
     equations, damping, done = _linearised(stage, stretches, signals), DAMPING, 0
+    none = np.zeros(stage.values.size)
     for _ in range(iterations):
         tick()
-        A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
         values, (lower, upper) = stage.values, stage.bounds
-        (middle, _), weight = stage.prior, _prior_weight(stage, loss, equations.rows)
-        pulled = b + weight * (middle - values)
+        middle, weight = stage.prior[0], _prior_weight(stage, loss, equations.rows)
+        A = equations.A.sum(axis=0) + weight
+        pulled = equations.b.sum(axis=0) + weight @ (middle - values)
+        height = _height(values - middle, weight)
         better, promised = None, np.inf
         while damping < MOST:
-            step = bounded_step(A, pulled, weight, lower - values, upper - values, damping)
-            promised = float(step @ (2.0 * b - A @ step))
+            step = bounded_step(A, pulled, none, lower - values, upper - values, damping)
+            promised = float(step @ (2.0 * pulled - A @ step))
             if promised < SLOW * loss:
                 break
             try:
@@ -141,13 +143,14 @@ def fit(
                 continue
             new_signals = [trial.signals(s) for s in stretches]
             new = _loss(trial, stretches, new_signals)
-            if new < loss:
+            gained = loss - new + height - _height(trial.values - middle, weight)
+            if gained > 0.0:
                 better = trial
                 break
             damping *= WORSE
         if better is None:
             break
-        fall, stage, loss, signals = 1.0 - new / loss, better, new, new_signals
+        fall, stage, loss, signals = gained / loss, better, new, new_signals
         damping = max(damping * BETTER, LEAST)
         equations, done = _linearised(stage, stretches, signals), done + 1
         if fall < SLOW or loss == 0.0:
@@ -155,9 +158,14 @@ def fit(
     return Fit(stage, loss, equations, done)
 
 
+def _height(away: Array, weight: Array) -> float:
+    """Return what a prior adds to the loss."""
+    return float(away @ weight @ away)
+
+
 def _prior_weight(stage: Stage, loss: float, rows: Integers) -> Array:
     observations = max(1.0, OBSERVATIONS * float(np.count_nonzero(rows)))
-    return loss / observations / stage.prior[1] ** 2
+    return stage.prior[1] * (loss / observations)
 
 
 def _loss(

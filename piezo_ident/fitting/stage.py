@@ -6,26 +6,29 @@ A stage of one axis as a free-run fit sees it: its numbers, its prediction, and 
 
     h = sum_j c_j phi_j[v]                               columns of a law of H
     w = h + sum_k s_k L_k h                              creep, L_k = 1 / (1 + tau_k p)
-    y = B(z)/A(z) z^-d w + offset + sum_k e_k exp(-t / tau_k)
+    y = B(z)/A(z) z^-d w + offset + sum_k s_k l_k exp(-t / tau_k)
 
-The numbers are c, s, a and b, the offset of each record, the decays e_k of creep from before each
-stretch, and the memory at the start of each stretch,
+The numbers are c, s, a and b, the offset of each record, the lags l_k of creep at the first sample
+of each stretch, and the memory at the start of each record,
 
     F_r(0) = v(0) - int_0^r m(r') dr',      0 <= m <= 1,
 
-with m constant on `PARTS` even parts of the thresholds.  With w_f = z^-d w/A and y_f = y/A the
-derivatives by b_j and a_i are shifts of two filtered signals, w_f(k-j+1) and -y_f(k-i): Ljung,
-System Identification, 2nd ed. (1999), section 10.3.
+with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
+begins with m = 0 and l = 0, as a simulation does: freed, both would take what H errs by.
+
+With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
+signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999), section 10.3.
 
 H rises with the voltage.  Right behind a turning point only its powers of v move; their slope is
-a quadratic in v, and its coefficients in the basis of Bernstein, (1-v)^2, 2v(1-v) and v^2, are
-the numbers of the fit, at least `LEAST_SLOPE` each.
+a quadratic in v, and its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and t^2 with t
+from 0 to 1 over the span of the law, are the numbers of the fit, at least `LEAST_SLOPE` each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+import functools
 import itertools
 
 import numpy as np
@@ -35,6 +38,7 @@ from piezo_ident.fitting.stretch import delayed, Stretch
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.play import play_columns
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
@@ -45,15 +49,15 @@ PARTS = 6
 LEAST_SLOPE = 0.05
 #: largest share of one element of creep: piezo ceramics creep by 1 to 5 % of a step in all
 MOST_CREEP = 0.1
-#: rms size of a share, of a decay of earlier creep, and of a share of the memory at a start about
-#: its first guess, known before
-CREEP_SPREAD, DECAY_SPREAD, START_SPREAD = 0.02, 0.02, 0.5
+#: rms size of a share, known before; of a lag of creep, a share of the range; and of a share of
+#: the memory at a start about its first guess
+CREEP_SPREAD, LAG_SPREAD, START_SPREAD = 0.02, 0.5, 0.5
+#: rms density of H, known before: the even density that makes the whole stroke over the range;
+#: and how much the density, and the slope behind a turning point, change over the range (taste:
+#: a quarter of that density, a third of the mean slope)
+DENSITY_SPREAD, DENSITY_CHANGE, SLOPE_CHANGE = 2.0, 0.5, 0.3
 #: step of the finite difference by a share of the memory
 STEP = 1e-3
-#: maps the slopes of Bernstein to the powers v^2, v^3 and v
-_POWERS = np.array([[-1.0, 1.0, 0.0], [1.0 / 3.0, -2.0 / 3.0, 1.0 / 3.0], [1.0, 0.0, 0.0]])
-#: the same of a law without v^2, whose middle slope is the first one
-_ODD_POWERS = np.array([[-1.0 / 3.0, 1.0 / 3.0], [1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +77,12 @@ class Stage:
     offsets : ndarray, shape (records,)
     taus, creep : ndarray, shape (k,)
         Time constants of creep [s] and their shares.
-    decays : ndarray, shape (stretches, k)
-    starts, guesses : ndarray, shape (stretches, PARTS)
-        Shares m of the memory, and what they are drawn to.
+    lags : ndarray, shape (stretches, k)
+        How far each element of creep is from its rest at the first sample.
+    resting : ndarray of bool, shape (stretches,)
+        Stretches that begin with all creep at rest.
+    starts, guesses : ndarray, shape (records, PARTS)
+        Shares m of the memory, and what they are drawn to; guesses of zero are known.
     """
 
     law: HysteresisLaw
@@ -85,7 +92,8 @@ class Stage:
     offsets: Array
     taus: Array
     creep: Array
-    decays: Array
+    lags: Array
+    resting: Mask
     starts: Array
     guesses: Array
 
@@ -96,7 +104,6 @@ class Stage:
         dynamics: Dynamics,
         delay: int,
         guesses: Array,
-        records: int,
     ) -> Stage:
         """Return a stage whose H is a straight line with the gain of `dynamics`."""
         c = np.zeros(law.size)
@@ -107,20 +114,18 @@ class Stage:
             c,
             dynamics.normalised(),
             delay,
-            np.zeros(records),
+            np.zeros(guesses.shape[0]),
             none,
             none,
-            np.empty((guesses.shape[0], 0)),
+            np.empty((0, 0)),
+            np.empty(0, dtype=bool),
             guesses.copy(),
             guesses,
         )
 
-    def with_creep(self, taus: Array) -> Stage:
+    def with_creep(self, taus: Array, stretches: Sequence[Stretch]) -> Stage:
         """Return the stage with elements of creep that have no share yet."""
-        k = taus.size
-        return replace(
-            self, taus=taus, creep=np.zeros(k), decays=np.zeros((self.starts.shape[0], k))
-        )
+        return replace(self, taus=taus, creep=np.zeros(taus.size)).on_other(stretches)
 
     def with_law(self, law: HysteresisLaw) -> Stage:
         """Return the stage with a wider law of H on the same thresholds."""
@@ -128,10 +133,12 @@ class Stage:
         c[self.law.within(law)] = self.coefficients
         return replace(self, law=law, coefficients=c)
 
-    def on_other(self, guesses: Array) -> Stage:
-        """Return the stage for other stretches, of which nothing is known yet."""
-        decays = np.zeros((guesses.shape[0], self.taus.size))
-        return replace(self, starts=guesses.copy(), guesses=guesses, decays=decays)
+    def on_other(self, stretches: Sequence[Stretch]) -> Stage:
+        """Return the stage for other stretches of the same records."""
+        known = np.logical_not(self.guesses.any(axis=1))
+        resting = [bool(known[s.record]) and not s.before.size for s in stretches]
+        lags = np.zeros((len(stretches), self.taus.size))
+        return replace(self, lags=lags, resting=np.array(resting))
 
     @property
     def hysteresis(self) -> Hysteresis:
@@ -154,14 +161,23 @@ class Stage:
                 self.creep,
                 *(() if G.is_static else (G.a, G.b)),
                 self.offsets,
-                self.decays.ravel(),
+                self.lags.ravel(),
                 self.starts.ravel(),
             ]
         )
 
-    @property
+    @functools.cached_property
     def _powers(self) -> Array:
-        return _ODD_POWERS if self.law.name == 'plays' else _POWERS
+        """Map slopes to the powers v^2, v^3 and v, or v^3 and v; shape (3, 3) or (2, 2)."""
+        low, high = self.law.span
+        if self.law.name == 'plays':
+            # the slope is least or most at zero and where |v| is largest
+            widest = 3.0 * max(-low, high) ** 2
+            return np.array([[-1.0 / widest, 1.0 / widest], [1.0, 0.0]])
+        # slopes of v^2, v^3 and v as Bernstein coefficients over the span
+        ends = np.array([[2.0 * low, 3.0 * low * low, 1.0], [2.0 * high, 3.0 * high * high, 1.0]])
+        middle = np.array([low + high, 3.0 * low * high, 1.0])
+        return np.asarray(np.linalg.inv([ends[0], middle, ends[1]]))
 
     def _sloped(self, c: Array) -> Array:
         """Return coefficients of the law with slopes in the place of its powers."""
@@ -173,14 +189,14 @@ class Stage:
         return np.concatenate([values[: -len(T)], T @ values[-len(T) :]])
 
     def _parts(self) -> list[slice]:
-        """Return the places of c, s, a and b, offsets, decays and starts among the values."""
+        """Return the places of c, s, a and b, offsets, lags and starts among the values."""
         G = self.dynamics
         sizes = [
             self.law.size,
             self.creep.size,
             0 if G.is_static else G.a.size + G.b.size,
             self.offsets.size,
-            self.decays.size,
+            self.lags.size,
             self.starts.size,
         ]
         ends = np.cumsum([0, *sizes])
@@ -189,23 +205,40 @@ class Stage:
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the values, shapes (p,)."""
-        h, creep, *_, starts = self._parts()
+        h, creep, *_, lags, starts = self._parts()
         p, n = starts.stop, len(self._powers)
         lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
         lower[h] = self.law.lower
         lower[h.stop - n : h.stop] = LEAST_SLOPE
         lower[creep], upper[creep] = 0.0, MOST_CREEP
+        lower[lags], upper[lags] = -1.0, 1.0
         lower[starts], upper[starts] = 0.0, 1.0
+        for part, known in (
+            (lags, self.resting),
+            (starts, np.logical_not(self.guesses.any(axis=1))),
+        ):
+            held = np.repeat(known, (part.stop - part.start) // max(known.size, 1))
+            lower[part] = np.where(held, 0.0, lower[part])
+            upper[part] = np.where(held, 0.0, upper[part])
         return lower, upper
 
     @property
     def prior(self) -> tuple[Array, Array]:
-        """What the values are drawn to, and the spread of each about it; shapes (p,)."""
-        _, creep, _, _, decays, starts = self._parts()
+        """
+        What the values are drawn to, shape (p,), and the information of a prior, shape (p, p).
+
+        A prior of one observation of the size of its residual.
+        """
+        h, creep, _, _, lags, starts = self._parts()
         middle, spread = np.zeros(starts.stop), np.full(starts.stop, np.inf)
         middle[starts], spread[starts] = self.guesses.ravel(), START_SPREAD
-        spread[creep], spread[decays] = CREEP_SPREAD, DECAY_SPREAD
-        return middle, spread
+        spread[creep], spread[lags] = CREEP_SPREAD, LAG_SPREAD
+        information = np.diag(spread**-2.0)
+        T = len(self._powers)
+        bend = np.diff(np.eye(h.stop)[h.stop - T :], axis=0) / SLOPE_CHANGE
+        shape = np.vstack([self.law.roughness(DENSITY_SPREAD, DENSITY_CHANGE), bend])
+        information[h, h] = shape.T @ shape
+        return middle, information
 
     def moved(self, values: Array) -> Stage:
         """
@@ -213,7 +246,7 @@ class Stage:
 
         ModelError where G is unstable, or its gain is none.
         """
-        h, creep, poles, offsets, decays, starts = self._parts()
+        h, creep, poles, offsets, lags, starts = self._parts()
         lower, upper = self.bounds
         values = np.clip(values, lower, upper)
         c, G = self._unsloped(values[h]), self.dynamics
@@ -230,30 +263,39 @@ class Stage:
             creep=values[creep],
             dynamics=G,
             offsets=values[offsets],
-            decays=values[decays].reshape(self.decays.shape),
+            lags=values[lags].reshape(self.lags.shape),
             starts=values[starts].reshape(self.starts.shape),
         )
 
     def memory(self, stretch: Stretch) -> Array:
         """Return the play outputs before the first sample of a stretch, shape (m,)."""
-        return self._memory(stretch, self.starts[stretch.number])
+        return self._memory(stretch, self.starts[stretch.record])
 
     def _memory(self, stretch: Stretch, shares: Array) -> Array:
-        r = self.law.thresholds
-        return memory_of(float(stretch.u[0]), float(r[-1]), shares, r)
+        r, before = self.law.thresholds, stretch.before
+        if not before.size:
+            return memory_of(float(stretch.u[0]), float(r[-1]), shares, r)
+        start = memory_of(float(before[0]), float(r[-1]), shares, r)
+        return play_columns(before, r, start)[:, -1]
 
     def signals(self, stretch: Stretch) -> tuple[Array, Array, Array]:
-        """Return h, the delayed w, and y without offset and decays; shapes (n,)."""
+        """Return h, the delayed w, and y without offset and lags; shapes (n,)."""
         h = self.hysteresis(stretch.u, self.memory(stretch))
         w = delayed(self._crept(h, stretch), self.delay)
         return h, w, filter_arx(self.dynamics.a, self.dynamics.b, w)
 
     def added(self, stretch: Stretch) -> Array:
-        """Return offset and decays of a stretch, shape (n,)."""
+        """Return offset and lags of a stretch, shape (n,)."""
         total = np.full(stretch.u.size, self.offsets[stretch.record])
-        for tau, left in zip(self.taus, self.decays[stretch.number], strict=True):
-            total += left * np.exp(-stretch.times / tau)
+        for share, tau, lag in self._unrest(stretch):
+            total += share * lag * np.exp(-stretch.times / tau)
         return total
+
+    def _unrest(self, stretch: Stretch) -> list[tuple[float, float, float]]:
+        """Return share, time constant and lag of each element of creep of a stretch."""
+        if not self.taus.size:
+            return []
+        return list(zip(self.creep, self.taus, self.lags[stretch.number], strict=True))
 
     def _crept(self, h: Array, stretch: Stretch) -> Array:
         seen = [(share, tau) for share, tau in zip(self.creep, self.taus, strict=True) if share]
@@ -279,9 +321,9 @@ class Stage:
                 powers.append(behind)
         for slope in T.T:
             yield np.asarray(slope @ np.array(powers))
-        for tau in self.taus:
-            lagged = delayed(stretch.lagged(h, tau), self.delay)
-            yield filter_arx(G.a, G.b, lagged)
+        for _, tau, lag in self._unrest(stretch):
+            behind = filter_arx(G.a, G.b, delayed(stretch.lagged(h, tau), self.delay))
+            yield behind + lag * np.exp(-stretch.times / tau) if lag else behind
         if not G.is_static:
             one = np.ones(1)
             y_f, w_f = -filter_arx(G.a, one, y), filter_arx(G.a, one, w)
@@ -289,13 +331,15 @@ class Stage:
             yield from (delayed(w_f, j) for j in range(G.b.size))
         for record in range(self.offsets.size):
             yield np.ones(h.size) if record == stretch.record else None
-        for number in range(self.decays.shape[0]):
-            for tau in self.taus:
-                yield np.exp(-stretch.times / tau) if number == stretch.number else None
+        for number in range(self.lags.shape[0]):
+            for share, tau, _ in self._unrest(stretch):
+                seen = number == stretch.number and share > 0.0 and not self.resting[number]
+                yield share * np.exp(-stretch.times / tau) if seen else None
         H = self.hysteresis
-        for number, shares in enumerate(self.starts):
+        for record, shares in enumerate(self.starts):
+            known = not self.guesses[record].any()
             for j, share in enumerate(shares):
-                if number != stretch.number:
+                if record != stretch.record or known:
                     yield None
                     continue
                 step = STEP if share < 0.5 else -STEP

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
@@ -28,9 +28,11 @@ class Stretch:
     rate : float
         [Hz]
     number : int
-        Place of the start among those of all stretches.
+        Place among all stretches.
     record : int
-        Place of the offset among those of all records.
+        Place of the record among all.
+    before : ndarray, shape (k,)
+        What the plays remember of the record's voltage before the stretch; empty at its start.
     """
 
     u: Array
@@ -40,6 +42,7 @@ class Stretch:
     rate: float
     number: int = 0
     record: int = 0
+    before: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def times(self) -> Array:
@@ -68,3 +71,28 @@ def delayed(x: Array, samples: int) -> Array:
     if samples == 0:
         return x
     return np.concatenate([np.full(min(samples, x.size), x[0]), x[: -samples or None]])
+
+
+def remembered(u: Array) -> Array:
+    """
+    Return the first value of u, its turning points, and its last value, shape (k,).
+
+    Of four in a row the inner two are left out where they lie between the outer two: no play
+    remembers them (wiping out).
+
+    Examples
+    --------
+    >>> remembered(np.array([0.0, 4.0, 1.0, 3.0, 2.0, 5.0])).tolist()
+    [0.0, 5.0]
+    """
+    x = u[np.concatenate([[True], np.diff(u) != 0.0])]
+    turns = np.diff(np.sign(np.diff(x))) != 0.0
+    kept: list[float] = []
+    for value in x[np.concatenate([[True], turns, [True]])[: x.size]].tolist():
+        kept.append(value)
+        while len(kept) > 3:
+            a, b, c, d = kept[-4:]
+            if not min(a, d) <= min(b, c) <= max(b, c) <= max(a, d):
+                break
+            del kept[-3:-1]
+    return np.array(kept)

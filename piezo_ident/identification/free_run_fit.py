@@ -20,7 +20,7 @@ from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.free_run import Fit, fit
 from piezo_ident.fitting.stage import memory_of, PARTS, Stage
-from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.fitting.stretch import remembered, Stretch
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.free_run_starts import Allowed, Search
 from piezo_ident.identification.hold_out import fitted_parts, MOVES
@@ -52,11 +52,16 @@ from piezo_ident.selection.comparison import best_of, Candidate
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 #: samples that the search simulates, and rows that the last fits count, at most
-MOST, MOST_ROWS = 60_000, 400_000
+MOST, MOST_ROWS = 100_000, 400_000
 #: blocks of all stretches together (taste: a fifth of them is held out in turn)
 BLOCKS = 50
 #: plays of H, that at r = 0 included, where the user asks for no number
 PLAYS = 40
+#: voltages for which H has to hold, normalised: a motion that is alike leaves the range by a
+#: little (taste: a seventh), and densities end with the span
+SPAN = (-0.15, 1.15)
+#: part of a window, one in so many, in which what began before it may ring (taste)
+RINGING = 20
 #: elements of creep that are tried, over all times that a record holds (one a decade)
 ELEMENTS = 5
 #: shortest time constant of creep [s]: what is faster is dynamics
@@ -89,9 +94,7 @@ def fit_free_run(
     kept = _thinned(stretches)
     start = best.fit.stage
     if search.stretches is not stretches:
-        start = replace(
-            start.on_other(guesses), offsets=np.resize(start.offsets[:1], len(stretches))
-        )
+        start = start.on_other(stretches)
     judged = fit(start, kept)
     progress('hysteresis', 0.6)
     everything = _thinned([s.with_use(run.use) for s, run in zip(stretches, chosen, strict=True)])
@@ -140,9 +143,9 @@ def _search(
     stretches: Sequence[Stretch], guesses: Array, settings: Settings, progress: Progress
 ) -> Search:
     if sum(s.u.size for s in stretches) > MOST:
-        stretches, guesses = _windows(stretches, guesses)
+        stretches = _windows(stretches)
     swing = max(float(np.ptp(s.u[s.use])) for s in stretches if s.use.any())
-    law = HysteresisLaw('plays', even_thresholds(swing, settings.thresholds or PLAYS))
+    law = HysteresisLaw('plays', even_thresholds(swing, settings.thresholds or PLAYS), SPAN)
     count = 1 + max(int(s.block[-1]) for s in stretches)
     steps = 0
 
@@ -154,12 +157,10 @@ def _search(
 
     allowed = Allowed(settings.delay, settings.order, settings.max_order)
     kinds = motion_kinds(stretches, count)
-    return Search(
-        stretches, interleaved(count), kinds, law, guesses, len(stretches), allowed, tick
-    )
+    return Search(stretches, interleaved(count), kinds, law, guesses, allowed, tick)
 
 
-def _windows(stretches: Sequence[Stretch], guesses: Array) -> tuple[list[Stretch], Array]:
+def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Return a few windows: of the widest motion, the fastest, and those in between."""
     size = MOST // 3
     windows = []
@@ -173,16 +174,20 @@ def _windows(stretches: Sequence[Stretch], guesses: Array) -> tuple[list[Stretch
     order = [int(np.argmax(spans)), int(np.argmax(speeds))]
     order += sorted(range(len(windows)), key=lambda i: -spans[i] * speeds[i])
     chosen = sorted(dict.fromkeys(order), key=order.index)[:3]
-    found, own, count = [], [], 0
+    found, count = [], 0
     for number, i in enumerate(sorted(chosen)):
         s, part = windows[i]
-        block = s.block[part] - s.block[part][0] + count
         # windows are short: of finer blocks more can be held out
-        fine = np.arange(block.size) * (BLOCKS // 3) // block.size + count
+        length = s.u[part].size
+        block = np.arange(length) * (BLOCKS // 3) // length + count
         count += BLOCKS // 3
-        found.append(Stretch(s.u[part], s.x[part], s.use[part], fine, s.rate, number, number))
-        own.append(guesses[s.number] if part.start == 0 else np.full(PARTS, 0.5))
-    return found, np.array(own)
+        use, before = s.use[part].copy(), np.empty(0)
+        if part.start:
+            before = remembered(s.u[: part.start + 1])
+            # what rings from before is not known
+            use[: length // RINGING] = False
+        found.append(Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before))
+    return found
 
 
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:
@@ -274,7 +279,7 @@ def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
     seen = stage.creep > 0.0
     if not seen.any():
         return memory
-    return Start(memory, stage.decays[i][seen] / stage.creep[seen])
+    return Start(memory, stage.lags[i][seen])
 
 
 def _start_of(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:

@@ -155,9 +155,8 @@ class Search:
         Of each block, for the comparison.
     law : HysteresisLaw
         Plays alone.
-    guesses : ndarray, shape (stretches, PARTS)
-        First guess of the memory of each start.
-    records : int
+    guesses : ndarray, shape (records, PARTS)
+        First guess of the memory at the start of each record; zeros are known.
     allowed : Allowed
     tick : callable
         Called between the steps; may raise to stop the work.
@@ -168,7 +167,6 @@ class Search:
     kinds: Integers | None
     law: HysteresisLaw
     guesses: Array
-    records: int
     allowed: Allowed
     tick: Callable[[], None]
 
@@ -192,9 +190,9 @@ class Search:
         wide = HysteresisLaw('preisach', stage.law.thresholds, stage.law.span)
         found = []
         for name, trial in (
-            ('creep', stage.with_creep(taus)),
+            ('creep', stage.with_creep(taus, self.stretches)),
             ('preisach', stage.with_law(wide)),
-            ('preisach, creep', stage.with_law(wide).with_creep(taus)),
+            ('preisach, creep', stage.with_law(wide).with_creep(taus, self.stretches)),
         ):
             effects = int(trial.taus.size > 0)
             found.append(self._candidate(f'{best.name}, {name}', self._fit(trial, MANY), effects))
@@ -233,7 +231,7 @@ class Search:
             if d not in tried:
                 start = min(tried.values(), key=lambda one: one.loss).stage if tried else None
                 if start is None:
-                    start = Stage.linear(self.law, Dynamics.unit(), d, self.guesses, self.records)
+                    start = Stage.linear(self.law, Dynamics.unit(), d, self.guesses)
                 tried[d] = self._fit(replace(start, delay=d), FEW)
             return tried[d]
 
@@ -257,7 +255,7 @@ class Search:
         found = []
         for d, G in linear_starts(inputs, self.stretches, self.allowed, ROUGH).values():
             start = (
-                Stage.linear(self.law, G, d, self.guesses, self.records)
+                Stage.linear(self.law, G, d, self.guesses)
                 if stage is None
                 else _with_dynamics(stage, d, G)
             )

@@ -100,6 +100,26 @@ class HysteresisLaw:
         """Lower bounds of the coefficients, shape (size,)."""
         return np.where(np.arange(self.size) < self.densities, 0.0, -np.inf)
 
+    def roughness(self, density: float, change: float) -> Array:
+        """
+        Return what measures the densities, and how much each changes with the place of its play.
+
+        Plays of an even density `density` measure one together.  What depends on the place, and
+        how neighbouring coefficients of its polynomials differ, measures one of `change`; shape
+        (k, size), to be multiplied by coefficients.
+        """
+        m, n = self.thresholds.size, self.densities
+        size = np.eye(n, self.size) / change
+        gaps = np.maximum(np.diff(self.thresholds, prepend=0.0), 1e-12)
+        size[:m] *= (change / density / np.sqrt(m) / gaps)[:, None]
+        width = 2 if self.name == 'bias' else DEGREE + 1
+        differences = [
+            (np.eye(self.size)[j + 1] - np.eye(self.size)[j]) / change
+            for j in range(m, n - 1)
+            if (j - m) % width < width - 1
+        ]
+        return np.vstack([size, *differences])
+
     @functools.cached_property
     def _parameters(self) -> Array:
         """

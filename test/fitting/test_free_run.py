@@ -22,7 +22,7 @@ NOISE = 1e-4
 
 
 def truth(records=1):
-    one = Stage.linear(LAW, G, 3, np.full((records, PARTS), 0.5), records)
+    one = Stage.linear(LAW, G, 3, np.full((records, PARTS), 0.5))
     c = np.array([0.2, 0.0, 0.15, 0.1, 0.05, -0.1, 0.6])
     rng = np.random.default_rng(5)
     return replace(
@@ -53,10 +53,7 @@ def measured(stage, seed=0):
 
 
 def rough(stage):
-    start = Stage.linear(
-        LAW, Dynamics([-1.3, 0.6], [0.2, 0.1]), 3, stage.guesses, len(stage.offsets)
-    )
-    return start
+    return Stage.linear(LAW, Dynamics([-1.3, 0.6], [0.2, 0.1]), 3, stage.guesses)
 
 
 @pytest.mark.parametrize('records', [1, 2])

@@ -22,13 +22,15 @@ def stage_of(name='plays', creep=True):
     rng = np.random.default_rng(3)
     law = HysteresisLaw(name, R)
     G = Dynamics([-1.2, 0.6], [0.3, 0.2, -0.1]).normalised()
-    one = Stage.linear(law, G, 2, np.full((2, PARTS), 0.5), 2)
+    one = Stage.linear(law, G, 2, np.full((2, PARTS), 0.5))
     c = np.where(law.lower == 0.0, rng.uniform(0.05, 0.1, law.size), 0.0)
     c[-2:] = 0.05, 0.6
     one = replace(one, coefficients=c, offsets=np.array([0.01, -0.02]))
     if creep:
-        one = replace(one.with_creep(np.array([0.02, 0.2])), creep=np.array([0.01, 0.02]))
-        one = replace(one, decays=np.array([[0.003, -0.002], [0.001, 0.004]]))
+        one = replace(
+            one.with_creep(np.array([0.02, 0.2]), stretches()), creep=np.array([0.01, 0.02])
+        )
+        one = replace(one, lags=np.array([[0.3, -0.2], [0.1, 0.4]]))
     return one
 
 
@@ -100,6 +102,6 @@ def test_H_rises_behind_every_turning_point_whatever_the_values(name):
 
 def test_a_wider_law_and_creep_begin_where_the_stage_was():
     one = stage_of(creep=False)
-    wide = one.with_law(HysteresisLaw('preisach', R)).with_creep(np.array([0.1]))
+    wide = one.with_law(HysteresisLaw('preisach', R)).with_creep(np.array([0.1]), stretches())
     for s in stretches():
         np.testing.assert_allclose(wide.signals(s)[2], one.signals(s)[2], atol=1e-12)

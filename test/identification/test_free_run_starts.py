@@ -63,9 +63,7 @@ def found_in(w, x, **allowed):
     stretch = Stretch((w - w.min()) / span, x / span, whole, block, FS)
     law = HysteresisLaw('plays', np.arange(1, 10) / 10.0)
     guess = np.full((1, PARTS), 0.5)
-    search = Search(
-        [stretch], interleaved(25), None, law, guess, 1, Allowed(**allowed), lambda: None
-    )
+    search = Search([stretch], interleaved(25), None, law, guess, Allowed(**allowed), lambda: None)
     best, _ = search.best()
     return best.fit.stage
 
