@@ -18,15 +18,18 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import time
 import warnings
 
+import bouc_wen
 from foreign.stage import make_core, make_linear, Stage
 import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
+from piezo_ident.common.errors import ModelError
+from piezo_ident.operators.dynamics import Delay, Dynamics
 from scipy.optimize import least_squares, nnls
 from scipy.signal import butter, chirp, lfilter, sosfiltfilt
 
@@ -67,12 +70,12 @@ def _levels(rng: np.random.Generator, n: int, hold: float, levels: int) -> Array
     return np.repeat(rng.integers(0, levels, n // size + 1) / (levels - 1), size)[:n]
 
 
-def motion(kind: str, rng: np.random.Generator) -> list[Array]:
+def motion(kind: str, rng: np.random.Generator, seconds: float = SECONDS) -> list[Array]:
     """Return the normalised voltages of one realisation of a kind; pairs have two records."""
-    n = int(SECONDS * RATE)
+    n = int(seconds * RATE)
     t = np.arange(n) / RATE
     if kind.startswith('pair'):
-        return [x for one in kind.split(': ')[1].split(' + ') for x in motion(one, rng)]
+        return [x for one in kind.split(': ')[1].split(' + ') for x in motion(one, rng, seconds)]
     a, b = rng.uniform(0.25, 0.35), rng.uniform(0.6, 0.7)
     slow = rng.uniform(0.8, 1.2)
     made = {
@@ -125,7 +128,7 @@ class Case:
     judge: list[tuple[Array, Array]]
 
 
-def draw(law: str, kind: str, seed: int) -> Case:
+def draw(law: str, kind: str, seed: int, seconds: float = SECONDS) -> Case:
     """Draw a case; the same law and seed give the same stage."""
     rng = np.random.default_rng([4711, seed, *law.encode()])
     core, linear = make_core(law, rng), make_linear(rng, RATE, 600.0)
@@ -136,7 +139,7 @@ def draw(law: str, kind: str, seed: int) -> Case:
     def records(name: str) -> list[tuple[Array, Array]]:
         return [
             (100.0 * u, stage.respond(100.0 * u, f'{name} {i}'))
-            for i, u in enumerate(motion(kind, own))
+            for i, u in enumerate(motion(kind, own, seconds))
         ]
 
     return Case(stage, kind, records('fit'), records('judge'))
@@ -250,9 +253,41 @@ def _records(records: list[tuple[Array, Array]]) -> list[pi.Record]:
     ]
 
 
-def program(records: list[tuple[Array, Array]]):
+def program(records: list[tuple[Array, Array]]) -> pi.StageModel:
     """Identify a model as a user does: no labels, no settings."""
-    return pi.identify(_records(records)).model.simulate
+    return pi.identify(_records(records)).model
+
+
+def drive_fault(model: pi.StageModel, rng: np.random.Generator) -> str:
+    """
+    Return what is wrong with H or the drive of an inverse, nothing where all is well.
+
+    H has to rise on its range.  The reference is random, in the middle of the stroke, and slower
+    than half the first mode.  The drive may be 1.2 times as wide as that of the model without G,
+    and its largest step 1.2 times as large.  A refusal names the model.
+    """
+    if model.hysteresis.lowest_slope() <= 0.0:
+        return 'H falls'
+    modes = [m.frequency for m in model.dynamics.modes(model.sample_rate)]
+    top = min([0.5 * f for f in modes] + [0.02 * model.sample_rate])
+    n = int(0.5 * model.sample_rate)
+    sos = butter(4, 0.5 * top, fs=model.sample_rate, output='sos')
+    x = sosfiltfilt(sos, rng.standard_normal(n))
+    reach = model.simulate(np.linspace(*model.scaling.range, n))
+    low, high = np.quantile(reach, [0.3, 0.7])
+    wanted = low + (high - low) * (x - x.min()) / np.ptp(x)
+    try:
+        drive = pi.invert(model, wanted).v
+        still = replace(model, dynamics=Dynamics.unit(), delay=Delay(0), effects=())
+        static = pi.invert(still, wanted).v
+    except ModelError as error:
+        return '' if 'model' in str(error) else f'refuses: {error}'
+    if np.ptp(drive) > 1.2 * np.ptp(static):
+        return f'drive {np.ptp(drive) / np.ptp(static):.2f} times as wide'
+    steps = [float(np.abs(np.diff(v)).max()) for v in (drive, static)]
+    if steps[0] > 1.2 * steps[1]:
+        return f'step {steps[0] / steps[1]:.2f} times as large'
+    return ''
 
 
 def judge(law: str, kind: str, seed: int) -> Row:
@@ -263,8 +298,11 @@ def judge(law: str, kind: str, seed: int) -> Row:
         warnings.simplefilter('ignore', UserWarning)
         peers = [percent(peer(case.fit), case.judge) for peer in PEERS]
         began = time.process_time()
-        own = percent(program(case.fit), case.judge)
-    return Row(law, kind, seed, own, tuple(peers), time.process_time() - began)
+        model = program(case.fit)
+        spent = time.process_time() - began
+        own = percent(model.simulate, case.judge)
+    fault = drive_fault(model, np.random.default_rng(seed))
+    return Row(law, kind, seed, own, tuple(peers), spent, fault)
 
 
 @dataclass(frozen=True)
@@ -272,7 +310,7 @@ class Row:
     """
     One case: errors of the program and of its peers on the second realisation [%].
 
-    `seconds` is the processor time of the program [s].
+    `seconds` is the processor time of the program [s], `fault` what is wrong with its inverse.
     """
 
     law: str
@@ -281,6 +319,7 @@ class Row:
     own: float
     peers: tuple[float, ...]
     seconds: float
+    fault: str
 
     @property
     def ratio(self) -> float:
@@ -288,8 +327,21 @@ class Row:
         return self.own / min(self.peers)
 
 
-def page(rows: Sequence[Row]) -> str:
+def springs(seed: int) -> list[tuple[str, float, float, float]]:
+    """Return name, rms, error of the program and of a linear model of the Bouc-Wen benchmark."""
+    made = bouc_wen.records(seed)
+    u, y = made.pop('fit')
+    record = pi.Record.from_arrays(u, y, sample_rate=bouc_wen.RATE, name='Bouc-Wen')
+    models = pi.identify([record]).model.simulate, linear([(u, y)])
+    return [
+        (name, float(y.std()), *(bouc_wen.rms_error(m(u), y, name) for m in models))
+        for name, (u, y) in made.items()
+    ]
+
+
+def page(rows: Sequence[Row], springs: Sequence[tuple[str, float, float, float]]) -> str:
     """Return the page of all cases, in Markdown."""
+    faults = [f'- {row.law}, {row.kind}: {row.fault}' for row in rows if row.fault]
     ratios = np.array([row.ratio for row in rows])
     laws = list(dict.fromkeys(row.law for row in rows))
     seeds = sorted({row.seed for row in rows})
@@ -330,6 +382,22 @@ def page(rows: Sequence[Row]) -> str:
         'The peers are a straight line, forty plays by non-negative least squares, linear output',
         'error of order 2 or 4 with delays of 0 to 7 samples, and plays with such an output error',
         'behind them.',
+        '',
+        '## Inverse',
+        '',
+        'For a random motion slower than half the first mode the drive has to be at most 1.2',
+        'times as wide, and its largest step 1.2 times as large, as without G; H has to rise.',
+        *(faults or ['All models do.']),
+        '',
+        '## Bouc-Wen benchmark',
+        '',
+        'A mass on a Bouc-Wen spring, from the equations of doi:10.4121/12967592: two periods of',
+        'a multisine from rest are fitted, with the noise of the benchmark. The hysteresis is in',
+        'the loop, and neither model has it there. Rms error [m]:',
+        '',
+        '| judged on | rms of y | `identify` | linear output error |',
+        '|---|---|---|---|',
+        *(f'| {name} | {y:.3g} | {own:.3g} | {peer:.3g} |' for name, y, own, peer in springs),
     ]
     return '\n'.join(lines) + '\n'
 
@@ -354,7 +422,7 @@ def main() -> None:
                 flush=True,
             )
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    given.out.write_text(page(rows), encoding='utf-8')
+    given.out.write_text(page(rows, springs(given.seeds[0])), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -192,13 +192,9 @@ def _linearised(
         at = np.flatnonzero(s.use)
         if not at.size:
             continue
-        e = (s.x - own[2] - stage.added(s))[at]
-        M = np.zeros((p, at.size))
-        for j, column in enumerate(stage.columns(s, own)):
-            if column is not None:
-                M[j] = column[at]
-        alive = np.flatnonzero(M.any(axis=1))
-        M, block = M[alive], s.block[at]
+        e, block = (s.x - own[2] - stage.added(s))[at], s.block[at]
+        columns = {j: c[at] for j, c in enumerate(stage.columns(s, own)) if c is not None}
+        alive, M = list(columns), np.array(list(columns.values()))
         edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [at.size]])
         for start, stop in itertools.pairwise(edges):
             k, part = block[start], M[:, start:stop]

@@ -25,11 +25,14 @@ from piezo_ident.identification.step1_delay import MAX_DELAY
 from piezo_ident.identification.step2_dynamics import factor_of, stabilised
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.selection.comparison import best_of, Candidate, candidate
+from piezo_ident.selection.comparison import best_of, Candidate, candidate, shown_effect
 from scipy.signal import butter, sosfilt
 
 #: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
+#: orders in a row that bring nothing, behind which no larger one is tried (taste: a mode that is
+#: missed by one order is found by the next but one)
+IDLE = 3
 #: steps of a rough fit and of a finished one
 FEW, MANY = 6, 15
 #: share of the sampling rate above which least squares looks for modes that slow motion hides
@@ -178,9 +181,14 @@ class Search:
         rough += self._rough(self._inputs(alone.stage), alone.stage)
         first = min(rough, key=lambda one: one.loss)
         starts = linear_starts(self._inputs(first.stage), self.stretches, self.allowed, ORDERS)
-        for (na, _), (d, G) in starts.items():
+        idle = 0
+        for (na, _), (d, G) in sorted(starts.items()):
             one = self._fit(_with_dynamics(first.stage, d, G), MANY)
+            least = min(c.price for c in found)
             found.append(self._candidate(f'order {na}', one))
+            idle = 0 if found[-1].price < least else idle + 1
+            if idle == IDLE:
+                break
         found += self._later(best_of(found))
         return best_of(found), tuple(found)
 
@@ -188,12 +196,15 @@ class Search:
         """Return the candidate with creep, with a wider law of H, and with both."""
         stage = best.fit.stage
         wide = HysteresisLaw('preisach', stage.law.thresholds, stage.law.span)
-        found = []
+        found: list[Candidate] = []
         for name, trial in (
             ('creep', stage.with_creep(taus, self.stretches)),
             ('preisach', stage.with_law(wide)),
             ('preisach, creep', stage.with_law(wide).with_creep(taus, self.stretches)),
         ):
+            if len(found) == 2 and shown_effect(found, best) is None:
+                # creep alone brings nothing
+                break
             effects = int(trial.taus.size > 0)
             found.append(self._candidate(f'{best.name}, {name}', self._fit(trial, MANY), effects))
         return found

@@ -21,17 +21,17 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.delay_check import upheld
-from piezo_ident.identification.noise_segment import (
-    band_of,
-    longest_noise,
-    noise_segment,
-    NoiseSegment,
-)
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.slow_part import fast_part
 from piezo_ident.identification.solvers.output_error import output_error, simulation_error
-from piezo_ident.identification.spectra import frequency_response
+from piezo_ident.identification.spectra import (
+    band_of,
+    frequency_response,
+    longest_noise,
+    noise_segment,
+    NoiseSegment,
+)
 from piezo_ident.identification.step1_delay import (
     delay_from_loss,
     delay_from_steps,

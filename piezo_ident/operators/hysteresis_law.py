@@ -104,14 +104,14 @@ class HysteresisLaw:
         """
         Return what measures the densities, and how much each changes with the place of its play.
 
-        Plays of an even density `density` measure one together.  What depends on the place, and
-        how neighbouring coefficients of its polynomials differ, measures one of `change`; shape
+        A play of a density `density` measures one.  So does a density `change` that depends on
+        the place, and a difference of neighbouring coefficients of its polynomials; shape
         (k, size), to be multiplied by coefficients.
         """
         m, n = self.thresholds.size, self.densities
         size = np.eye(n, self.size) / change
         gaps = np.maximum(np.diff(self.thresholds, prepend=0.0), 1e-12)
-        size[:m] *= (change / density / np.sqrt(m) / gaps)[:, None]
+        size[:m] *= (change / density / gaps)[:, None]
         width = 2 if self.name == 'bias' else DEGREE + 1
         differences = [
             (np.eye(self.size)[j + 1] - np.eye(self.size)[j]) / change

@@ -72,7 +72,18 @@ def candidate(
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate:
-    """Return the candidate of the least price; of those alike, the one with fewest parameters."""
+    """
+    Return the candidate of the least price; of those alike, the one with fewest parameters.
+
+    Of as many parameters the lower price is taken.
+    """
     least = min(c.price for c in candidates)
     alike = [c for c in candidates if c.price <= ALIKE * least]
-    return min(alike, key=lambda c: c.fit.stage.size)
+    return min(alike, key=lambda c: (c.fit.stage.size, c.price))
+
+
+def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
+    """Return what errs least of those with more effects than the chosen one, if it errs less."""
+    more = [c for c in candidates if c.effects > chosen.effects]
+    best = min(more, key=lambda c: c.error, default=None)
+    return best if best is not None and ALIKE * best.error < chosen.error else None

@@ -1,0 +1,284 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the free-run fits of unlabelled records come to: model, starts, results, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Mask, true_runs
+from piezo_ident.fitting.free_run import Fit
+from piezo_ident.fitting.stage import memory_of, Stage
+from piezo_ident.identification.errors import key_of
+from piezo_ident.identification.prepare import Run
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    FitOutcome,
+    Settings,
+)
+from piezo_ident.identification.spectra import broadband_response, excited_band, highest_frequency
+from piezo_ident.identification.step3_hysteresis import (
+    factorise,
+    fit_hysteresis,
+    HysteresisFit,
+)
+from piezo_ident.identification.three_steps import within
+from piezo_ident.identification.warnings import only_jumps, warn_of_range, warn_of_zeros
+from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.model.stream import Start
+from piezo_ident.operators.dynamics import Delay
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.selection.comparison import Candidate, shown_effect
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRunFits:
+    """
+    What was fitted: to all but what is held out, then to everything.
+
+    Attributes
+    ----------
+    chosen, parts : sequence
+        Runs that were fitted, and which samples of each were not held out.
+    judged, last : Fit
+    found : sequence of Candidate
+        What was compared.
+    best : Candidate
+        What was chosen of it.
+    """
+
+    chosen: Sequence[Run]
+    parts: Sequence[Mask]
+    judged: Fit
+    last: Fit
+    found: Sequence[Candidate]
+    best: Candidate
+
+
+def outcome_of(
+    fits: FreeRunFits, runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings
+) -> FitOutcome:
+    """Return model, results of the steps, starts and warnings."""
+    chosen, parts, last = fits.chosen, fits.parts, fits.last
+    hysteresis = _hysteresis_result(fits, settings)
+    model = _model(last.stage, hysteresis.hysteresis, rate, scaling, float(hysteresis.offsets[0]))
+    tested = _model(fits.judged.stage, None, rate, scaling, float(fits.judged.stage.offsets[0]))
+    low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
+    keys = [key_of(run) for run in runs]
+    # where two have one name nobody could tell whose start it is
+    own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
+    stage, judged = last.stage, fits.judged.stage
+    memories = {key: _start(stage, i, chosen[i], model) for key, i in own.items()}
+    at_test = {key: _start(judged, i, chosen[i], tested) for key, i in own.items()}
+    offsets = {
+        key: scaling.Y * float(judged.offsets[i] - judged.offsets[0]) for key, i in own.items()
+    }
+    fitted = {id(run): mask for run, mask in zip(chosen, parts, strict=True)}
+    nothing = [np.zeros(run.piece.n, dtype=bool) for run in runs]
+    masks = [(fitted.get(id(run), none), none) for run, none in zip(runs, nothing, strict=True)]
+    band = max(
+        excited_band(run.u[run.use] - run.u[run.use].mean(), rate, depth=1e-4) for run in chosen
+    )
+    delay = _delay_result(fits, settings, rate, band)
+    missing = _missing(fits, delay, rate, band)
+    names = ', '.join(_named(run, mask) for run, mask in zip(chosen, parts, strict=True))
+    warnings = [
+        'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
+        f'together to {names}, as the errors say; the model was then fitted to all of it',
+        *warn_of_range(chosen, parts, scaling),
+        *warn_of_zeros(offsets, scaling),
+        *_warn_of_creep(fits),
+    ]
+    return FitOutcome(
+        model=within(model, low, high),
+        delay=delay,
+        dynamics=_dynamics_result(fits, rate, band),
+        hysteresis=hysteresis,
+        masks=masks,
+        warnings=warnings,
+        not_identified=tuple(missing.items()),
+        memories=memories,
+        offsets=offsets,
+        judged=(tested, at_test),
+    )
+
+
+def _model(
+    stage: Stage, hysteresis: Hysteresis | None, rate: float, scaling: Scaling, offset: float
+) -> StageModel:
+    effects: tuple[EffectSetting, ...] = ()
+    seen = stage.creep > 0.0
+    if seen.any():
+        values = {'gain': stage.creep[seen].tolist(), 'time_constant': stage.taus[seen].tolist()}
+        effects = (EffectSetting('creep', values),)
+    H = _compact(stage.hysteresis) if hysteresis is None else hysteresis
+    moved = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
+    return StageModel(rate, moved, H, stage.dynamics, Delay(stage.delay), effects)
+
+
+def _compact(H: Hysteresis) -> Hysteresis:
+    """Return H without plays that weigh nothing."""
+    if H.curves is not None or H.bias is not None:
+        return H
+    used = H.weights > 0.0
+    return replace(H, thresholds=H.thresholds[used], weights=H.weights[used])
+
+
+def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
+    """Return the start of a run in terms of the model."""
+    memory = _start_of(stage, i, run, model.hysteresis.thresholds)
+    seen = stage.creep > 0.0
+    if not seen.any():
+        return memory
+    return Start(memory, stage.lags[i][seen])
+
+
+def _start_of(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
+    """Return the play outputs at the start of a run."""
+    widest = float(stage.law.thresholds[-1])
+    return memory_of(float(run.u[0]), widest, stage.starts[i], thresholds)
+
+
+def _hysteresis_result(fits: FreeRunFits, settings: Settings) -> HysteresisFit:
+    last = fits.last
+    stage, law = last.stage, last.stage.law
+    if settings.solver == 'swarm':
+        return _swarm(stage, fits.chosen, settings)
+    errors: dict[str, float] = {}
+    for c in fits.found:
+        name = c.fit.stage.law.name
+        errors[name] = min(float(np.sqrt(c.error)), errors.get(name, np.inf))
+    whole = last.covariance()[: law.size, : law.size]
+    H = _compact(stage.hysteresis)
+    std = law.deviations(whole)
+    used = np.isin(law.thresholds, H.thresholds)
+    return HysteresisFit(
+        hysteresis=H,
+        offsets=stage.offsets,
+        solver='least_squares',
+        polished=False,
+        loss=last.loss,
+        swarm_loss=None,
+        optimum_loss=last.loss,
+        n=last.n,
+        std=np.concatenate([std[:-2][used], std[-2:]]),
+        swarm=None,
+        coefficients=stage.coefficients,
+        law=law.name,
+        errors_of_laws=errors,
+    )
+
+
+def _swarm(stage: Stage, runs: Sequence[Run], settings: Settings) -> HysteresisFit:
+    """Return the weights that the swarm finds with G and the starts of the free-run fit."""
+    excerpts = []
+    for i, run in enumerate(runs):
+        excerpts.append(replace(run.excerpt(run.use), memory=partial(_start_of, stage, i, run)))
+    R = factorise(excerpts, stage.law, stage.dynamics, Delay(stage.delay))
+    return fit_hysteresis(
+        R,
+        stage.law,
+        sum(int(e.use.sum()) for e in excerpts),
+        solver='swarm',
+        polish=settings.polish,
+        rows=sum(e.rows for e in excerpts),
+        rng=np.random.default_rng(settings.seed),
+        swarm_size=settings.swarm_size,
+        maxiter=settings.swarm_iterations,
+    )
+
+
+def _delay_result(fits: FreeRunFits, settings: Settings, rate: float, band: float) -> DelayResult:
+    d = fits.last.stage.delay
+    if settings.delay is not None:
+        return DelayResult(settings.delay, float('inf'), 'given')
+    if d == 0 and fits.last.stage.dynamics.is_static:
+        return DelayResult(0, float('inf'), 'none')
+    # a drive that ends at f leaves a doubt of half a period of f
+    return DelayResult(d, max(1.0 / np.sqrt(12.0), 0.05 * rate / band), 'free run')
+
+
+def _dynamics_result(fits: FreeRunFits, rate: float, band: float) -> DynamicsResult:
+    last = fits.last
+    stage, G = last.stage, last.stage.dynamics
+    runs, parts = fits.chosen, fits.parts
+    undone = [
+        stage.hysteresis(run.u, _start_of(stage, i, run, stage.law.thresholds))
+        for i, run in enumerate(runs)
+    ]
+    response = broadband_response(
+        [
+            (run.u[a:b], w[a:b], run.x[a:b])
+            for run, w, mask in zip(runs, undone, parts, strict=True)
+            for a, b in true_runs(run.use & mask)
+        ],
+        rate,
+    )
+    covariance = np.zeros((1, 1))
+    if not G.is_static:
+        at = stage.law.size + stage.creep.size
+        n = G.a.size + G.b.size
+        covariance = last.covariance()[at : at + n, at : at + n]
+    whole = float(np.std(np.concatenate([run.x[run.use] for run in runs])))
+    methods = {c.name: 100.0 * float(np.sqrt(c.error)) / whole for c in fits.found}
+    return DynamicsResult(
+        (0, 1) if G.is_static else (G.a.size, G.b.size),
+        None,
+        methods,
+        covariance,
+        response,
+        band=band,
+    )
+
+
+def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) -> dict[str, str]:
+    """Return what these data do not tell, and why."""
+    missing = {}
+    if delay.source == 'none':
+        missing['delay'] = 'no delay errs less on held-out motion than none; add steps or noise'
+    if fits.last.stage.dynamics.is_static:
+        missing['dynamics'] = (
+            'no order of G errs clearly less on held-out motion than the hysteresis and a pure '
+            f'delay (the voltage moves up to {band:.3g} Hz); add steps or noise'
+        )
+    elif modes := fits.last.stage.dynamics.modes(rate):
+        lowest = min(mode.frequency for mode in modes)
+        reach = max(highest_frequency(run.u, rate) for run in fits.chosen)
+        if reach < lowest:
+            missing['dynamics'] = (
+                f'the voltage moves up to {reach:.3g} Hz, and the lowest mode of G lies at '
+                f'{lowest:.3g} Hz, where nothing was seen of it; add steps or noise'
+            )
+    if reason := only_jumps(fits.chosen):
+        missing['hysteresis'] = reason
+    return missing
+
+
+def _warn_of_creep(fits: FreeRunFits) -> list[str]:
+    """Say when a model with creep, too, errs less, but not by as much as an effect must."""
+    more = shown_effect(fits.found, fits.best)
+    if more is None:
+        return []
+    ours, theirs = (100.0 * float(np.sqrt(c.error)) for c in (fits.best, more))
+    share = 100.0 * float(more.fit.stage.creep.sum())
+    return [
+        f'the stage may creep: with creep of {share:.2g} % the model predicts parts of the data '
+        f'from the others to {theirs:.2g} % of stroke instead of {ours:.2g} %, too little to tell '
+        'creep from what H lacks; hold a voltage for some seconds behind a step'
+    ]
+
+
+def _named(run: Run, fitted: Mask) -> str:
+    """Return what is fitted of a run, in words."""
+    held = true_runs(~fitted)
+    rate = run.piece.sample_rate
+    if len(held) == 1 and held[0][1] == fitted.size:
+        return f'the first {held[0][0] / rate:.4g} s of {run.record}'
+    share = 100.0 * float(np.mean(~fitted))
+    return f'{run.record} without {len(held)} stretches, {share:.0f} % of it, that are held out'
