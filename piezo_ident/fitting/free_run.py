@@ -114,48 +114,63 @@ def fit(
     """
     if not any(s.use.any() for s in stretches):
         raise IdentificationError('no sample is left to fit; hold out less')
-    signals = [stage.signals(s) for s in stretches]
-    loss = _loss(stage, stretches, signals)
-    if not np.isfinite(loss):
+    here = _at(stage, stretches)
+    if not np.isfinite(here.loss):
         raise IdentificationError(
             'the first guess of the free-run fit diverges on these data; are all values of a '
             'plausible size?'
         )
-    equations, damping, done = _linearised(stage, stretches, signals), DAMPING, 0
-    none = np.zeros(stage.values.size)
+    equations, damping, done = _linearised(here, stretches), DAMPING, 0
     for _ in range(iterations):
         tick()
-        values, (lower, upper) = stage.values, stage.bounds
-        middle, weight = stage.prior[0], _prior_weight(stage, loss, equations.rows)
-        A = equations.A.sum(axis=0) + weight
-        pulled = equations.b.sum(axis=0) + weight @ (middle - values)
-        height = _height(values - middle, weight)
-        better, promised = None, np.inf
-        while damping < MOST:
-            step = bounded_step(A, pulled, none, lower - values, upper - values, damping)
-            promised = float(step @ (2.0 * pulled - A @ step))
-            if promised < SLOW * loss:
-                break
-            try:
-                trial = stage.moved(values + step)
-            except ModelError:
-                damping *= WORSE
-                continue
-            new_signals = [trial.signals(s) for s in stretches]
-            new = _loss(trial, stretches, new_signals)
-            gained = loss - new + height - _height(trial.values - middle, weight)
-            if gained > 0.0:
-                better = trial
-                break
-            damping *= WORSE
+        better, gained, damping = _step(here, equations, stretches, damping)
         if better is None:
             break
-        fall, stage, loss, signals = gained / loss, better, new, new_signals
+        fall, here = gained / here.loss, better
         damping = max(damping * BETTER, LEAST)
-        equations, done = _linearised(stage, stretches, signals), done + 1
-        if fall < SLOW or loss == 0.0:
+        equations, done = _linearised(here, stretches), done + 1
+        if fall < SLOW or here.loss == 0.0:
             break
-    return Fit(stage, loss, equations, done)
+    return Fit(here.stage, here.loss, equations, done)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A stage, its signals on each stretch, and its sum of squares."""
+
+    stage: Stage
+    signals: Sequence[tuple[Array, Array, Array]]
+    loss: float
+
+
+def _at(stage: Stage, stretches: Sequence[Stretch]) -> _Point:
+    signals = [stage.signals(s) for s in stretches]
+    return _Point(stage, signals, _loss(stage, stretches, signals))
+
+
+def _step(
+    here: _Point, equations: Equations, stretches: Sequence[Stretch], damping: float
+) -> tuple[_Point | None, float, float]:
+    """Return the first point that is better, by how much, and its damping; None for none."""
+    values, (lower, upper) = here.stage.values, here.stage.bounds
+    middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
+    A = equations.A.sum(axis=0) + weight
+    b = equations.b.sum(axis=0) + weight @ (middle - values)
+    height, none = _height(values - middle, weight), np.zeros(values.size)
+    while damping < MOST:
+        step = bounded_step(A, b, none, lower - values, upper - values, damping)
+        if float(step @ (2.0 * b - A @ step)) < SLOW * here.loss:
+            break
+        try:
+            there = _at(here.stage.moved(values + step), stretches)
+        except ModelError:
+            damping *= WORSE
+            continue
+        gained = here.loss - there.loss + height - _height(there.stage.values - middle, weight)
+        if gained > 0.0:
+            return there, gained, damping
+        damping *= WORSE
+    return None, 0.0, damping
 
 
 def _height(away: Array, weight: Array) -> float:
@@ -180,15 +195,14 @@ def _loss(
         )
 
 
-def _linearised(
-    stage: Stage, stretches: Sequence[Stretch], signals: Sequence[tuple[Array, Array, Array]]
-) -> Equations:
+def _linearised(here: _Point, stretches: Sequence[Stretch]) -> Equations:
     """Return the normal equations of all stretches, block by block."""
     count = 1 + max(int(s.block[-1]) for s in stretches)
+    stage = here.stage
     p = stage.values.size
     A, b, total = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros(count)
     rows = np.zeros(count, dtype=np.int64)
-    for s, own in zip(stretches, signals, strict=True):
+    for s, own in zip(stretches, here.signals, strict=True):
         at = np.flatnonzero(s.use)
         if not at.size:
             continue

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.fitting.stage import LEAST_SLOPE, memory_of, PARTS, Stage
-from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.fitting.stretch import remembered, Stretch
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.play import play_columns
 import pytest
 
 RATE = 1000.0
@@ -105,3 +106,35 @@ def test_a_wider_law_and_creep_begin_where_the_stage_was():
     wide = one.with_law(HysteresisLaw('preisach', R)).with_creep(np.array([0.1]), stretches())
     for s in stretches():
         np.testing.assert_allclose(wide.signals(s)[2], one.signals(s)[2], atol=1e-12)
+
+
+def test_a_window_begins_with_what_the_plays_remember_of_its_record():
+    one, [whole, _] = stage_of(), stretches()
+    columns = play_columns(whole.u, R, one.memory(whole))
+    for start in (1, 50, 333):
+        before = remembered(whole.u[: start + 1])
+        assert before.size < 40
+        window = replace(whole, u=whole.u[start:], before=before)
+        np.testing.assert_allclose(one.memory(window), columns[:, start], atol=1e-12)
+
+
+def test_a_record_at_rest_begins_as_a_simulation_does():
+    one, [rests, moves] = stage_of(creep=False), stretches()
+    guesses = np.array([np.zeros(PARTS), np.full(PARTS, 0.5)])
+    one = replace(one, guesses=guesses, starts=guesses)
+    one = one.with_creep(np.array([0.1]), [rests, moves])
+    moved = one.moved(one.values + 0.3)
+    assert not moved.starts[0].any() and not moved.lags[0].any()
+    assert moved.starts[1].all() and moved.lags[1].all()
+
+
+def test_a_density_of_all_places_is_smooth_and_one_of_some_is_not():
+    law = HysteresisLaw('preisach', R)
+    flat, steep = np.zeros(law.size), np.zeros(law.size)
+    flat[R.size : R.size + 4], steep[R.size] = 0.25, 1.0
+    sizes = [np.linalg.norm(law.roughness(2.0, 0.5) @ c) for c in (flat, steep)]
+    assert sizes[0] < 0.5 * sizes[1]
+    # the same density in plays is cheaper still: they hold at every place
+    plays = np.zeros(law.size)
+    plays[: R.size] = flat @ law._parameters[:, : R.size]
+    assert np.linalg.norm(law.roughness(2.0, 0.5) @ plays) < sizes[0]

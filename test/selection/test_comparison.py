@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.fitting.stretch import Stretch
-from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, EFFECT
+from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, EFFECT, shown_effect
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 
@@ -26,6 +26,19 @@ def test_an_effect_has_to_take_most_of_what_is_left():
     plain = one('plain', 1.0)
     assert best_of([plain, one('creep', 1.05 * EFFECT, 5, 1)]).name == 'plain'
     assert best_of([plain, one('creep', 0.9 * EFFECT / ALIKE, 5, 1)]).name == 'creep'
+
+
+def test_of_those_alike_and_as_small_the_better_wins():
+    assert best_of([one('a', 1.0), one('b', 0.99)]).name == 'b'
+
+
+def test_an_effect_that_helps_too_little_to_be_taken_is_shown():
+    plain = one('plain', 1.0)
+    little, much = one('little', 0.99 / ALIKE, 5, 1), one('hardly', 1.01 / ALIKE, 5, 1)
+    assert best_of([plain, little]) is plain
+    assert shown_effect([plain, little], plain) is little
+    assert shown_effect([plain, much], plain) is None
+    assert shown_effect([plain], plain) is None
 
 
 def test_both_ways_of_holding_out_count():
