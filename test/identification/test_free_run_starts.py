@@ -90,7 +90,8 @@ def test_a_chirp_in_much_noise_shows_both_modes():
     x = stage(w)
     x += 0.2 * np.std(x) * np.random.default_rng(3).standard_normal(x.size)
     modes = [m for m in found_in(w, x).dynamics.modes(FS) if m.damping < 0.1]
-    modes = [m for m in modes if m.frequency < 5000.0]
+    # what lies above the drive stands for the part of a sample of the delay
+    modes = [m for m in modes if m.frequency < 4000.0]
     assert [round(mode.frequency / 10.0) for mode in modes] == [90, 230]
     assert_allclose([mode.damping for mode in modes], [0.01, 0.015], rtol=0.05)
 
