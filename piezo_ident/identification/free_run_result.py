@@ -266,10 +266,9 @@ def _warn_of_creep(fits: FreeRunFits) -> list[str]:
     if more is None:
         return []
     ours, theirs = (100.0 * float(np.sqrt(c.error)) for c in (fits.best, more))
-    share = 100.0 * float(more.fit.stage.creep.sum())
     return [
-        f'the stage may creep: with creep of {share:.2g} % the model predicts parts of the data '
-        f'from the others to {theirs:.2g} % of stroke instead of {ours:.2g} %, too little to tell '
+        f'the stage may creep: with creep the model predicts parts of the data from the others to '
+        f' {theirs:.2g} % of stroke instead of {ours:.2g} %, too little to tell '
         'creep from what H lacks; hold a voltage for some seconds behind a step'
     ]
 
