@@ -5,8 +5,7 @@
 Records without labelled segments: a list of starts, one free-run fit, one comparison.
 
 The search works on `MOST` samples.  What it finds is fitted to all that is not held out, and
-judged by what is; in the end it is fitted to everything.  `make any-record` sets it beside
-`piezo_ident.identification.unlabelled`, which it is to replace.
+judged by what is; in the end it is fitted to everything.  `make any-record` sets it beside peers.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from piezo_ident.fitting.free_run import fit
 from piezo_ident.fitting.stage import PARTS
 from piezo_ident.fitting.stretch import remembered, Stretch
 from piezo_ident.identification.free_run_result import FreeRunFits, outcome_of
-from piezo_ident.identification.free_run_starts import Allowed, Search
+from piezo_ident.identification.free_run_starts import Allowed, Search, UNKNOWN
 from piezo_ident.identification.hold_out import fitted_parts, MOVES
 from piezo_ident.identification.prepare import REST, Run
 from piezo_ident.identification.results import (
@@ -103,7 +102,7 @@ def _refuse_rest(runs: Sequence[Run], parts: Sequence[Mask]) -> None:
 def _stretches(runs: Sequence[Run], parts: Sequence[Mask]) -> tuple[list[Stretch], Array]:
     """Return runs as stretches, with blocks of one length, and the guess of each memory."""
     size = max(1, sum(run.u.size for run in runs) // BLOCKS)
-    stretches, guesses, count = [], np.full((len(runs), PARTS), 0.5), 0
+    stretches, guesses, count = [], np.full((len(runs), PARTS), UNKNOWN), 0
     for i, (run, mask) in enumerate(zip(runs, parts, strict=True)):
         n = max(1, round(run.u.size / size))
         block = count + np.minimum(np.arange(run.u.size) * n // run.u.size, n - 1)

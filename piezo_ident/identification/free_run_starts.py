@@ -33,6 +33,8 @@ ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
 #: orders in a row that bring nothing, behind which no larger one is tried (taste: a mode that is
 #: missed by one order is found by the next but one)
 IDLE = 3
+#: share of the memory at a start of which nothing is known
+UNKNOWN = 0.5
 #: steps of a rough fit and of a finished one
 FEW, MANY = 6, 15
 #: share of the sampling rate above which least squares looks for modes that slow motion hides
@@ -174,8 +176,32 @@ class Search:
     tick: Callable[[], None]
 
     def best(self) -> tuple[Candidate, tuple[Candidate, ...]]:
-        """Return the best candidate, and all."""
+        """
+        Return the best candidate, and all.
+
+        No start is known where a free memory at those at rest takes what an effect must.
+        """
         alone = self._hysteresis_alone()
+        if self._starts_otherwise(self._candidate('hysteresis', alone)):
+            return self._unknown_starts.best()
+        found = self._orders(alone)
+        best = best_of(found)
+        if self._starts_otherwise(best):
+            return self._unknown_starts.best()
+        return best, tuple(found)
+
+    @property
+    def _unknown_starts(self) -> Search:
+        return replace(self, guesses=np.where(self.guesses > 0.0, self.guesses, UNKNOWN))
+
+    def _starts_otherwise(self, one: Candidate) -> bool:
+        if self.guesses.any(axis=1).all():
+            return False
+        stage = replace(one.fit.stage, guesses=self._unknown_starts.guesses)
+        free = self._candidate('free start', self._fit(stage, FEW), 1)
+        return best_of([one, free]) is free
+
+    def _orders(self, alone: Fit) -> list[Candidate]:
         found = [self._candidate('hysteresis', alone)]
         rough = [alone, *self._rough([s.u for s in self.stretches], None)]
         rough += self._rough(self._inputs(alone.stage), alone.stage)
@@ -189,8 +215,7 @@ class Search:
             idle = 0 if found[-1].price < least else idle + 1
             if idle == IDLE:
                 break
-        found += self._later(best_of(found))
-        return best_of(found), tuple(found)
+        return found + self._later(best_of(found))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
         """Return the candidate with creep, with a wider law of H, and with both."""
