@@ -9,6 +9,7 @@ from piezo_ident.fitting.stage import PARTS
 from piezo_ident.fitting.stretch import Stretch
 from piezo_ident.identification.free_run_starts import Allowed, Search
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.play import play_columns
 from piezo_ident.selection.motion_kinds import interleaved
 import pytest
 from scipy import signal
@@ -120,3 +121,19 @@ def test_a_given_delay_and_order_are_kept():
     found = found_in(w, stage(w), delay=2, order=(4, 6))
     assert found.delay == 2
     assert (found.dynamics.a.size, found.dynamics.b.size) in [(4, 6), (0, 1)]
+
+
+def test_plays_in_the_middle_of_their_bands_are_no_start_as_of_a_simulation():
+    rng = np.random.default_rng(4)
+    u = np.concatenate([np.zeros(50), np.cumsum(rng.standard_normal(3000))])
+    u = np.abs(u) / np.abs(u).max()
+    law = HysteresisLaw('plays', np.array([0.2, 0.6, 0.95]))
+    middle = play_columns(u, law.thresholds, -0.5 * law.thresholds)
+    x = 0.6 * u + 0.4 * np.array([0.3, 0.3, 0.4]) @ middle + 1e-4 * rng.standard_normal(u.size)
+    block = np.arange(u.size) * 25 // u.size
+    stretch = Stretch(u, x, np.ones(u.size, dtype=bool), block, FS)
+    known, allowed = np.zeros((1, PARTS)), Allowed(order=(1, 2), delay=0)
+    search = Search([stretch], interleaved(25), None, law, known, allowed, lambda: None)
+    best, _ = search.best()
+    assert best.fit.rms < 2e-4
+    assert_allclose(best.fit.stage.memory(stretch), -0.5 * law.thresholds, atol=0.05)
