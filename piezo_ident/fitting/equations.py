@@ -56,7 +56,8 @@ class Equations:
             A_out, b_out = self.A[out], self.b[out]
             theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), none, lower, upper)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
-        return np.asarray(np.maximum(errors, 0.0))
+        # far from its minimum a fit promises by its derivatives what it does not keep
+        return np.asarray(np.maximum(errors, self.s))
 
 
 def bounded_step(

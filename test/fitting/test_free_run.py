@@ -130,3 +130,9 @@ def test_nothing_to_fit_is_refused_and_the_work_can_be_stopped():
 
     with pytest.raises(Cancelled):
         fit(rough(stage), [s], tick=stop)
+
+
+def test_a_fit_that_has_not_converged_promises_no_less_than_it_leaves():
+    stage = truth()
+    start = fit(rough(stage), measured(stage), iterations=0)
+    assert start.held_out(np.arange(20) % 5).sum() >= start.loss
