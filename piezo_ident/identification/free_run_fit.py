@@ -36,8 +36,9 @@ from piezo_ident.record.suspicions import rises_first
 from piezo_ident.selection.comparison import best_of
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
-#: samples that the search simulates, and rows that the last fits count, at most
-MOST, MOST_ROWS = 100_000, 400_000
+#: samples of records that the search simulates whole, those of windows of longer ones, and rows
+#: that the last fits count, at most (time: a search of windows takes half of a minute)
+MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
 #: blocks of all stretches together (taste: a fifth of them is held out in turn)
 BLOCKS = 50
 #: plays of H, that at r = 0 included, where the user asks for no number
@@ -137,7 +138,7 @@ def _search(
 
 def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Return a few windows: of the widest motion, the fastest, and those in between."""
-    size = MOST // 3
+    size = WINDOWED // 3
     windows = []
     for s in stretches:
         for start in range(0, max(1, s.u.size - size // 2), size):
