@@ -30,9 +30,6 @@ from scipy.signal import butter, sosfilt
 
 #: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
-#: orders in a row that bring nothing, behind which no larger one is tried (taste: a mode that is
-#: missed by one order is found by the next but one)
-IDLE = 3
 #: share of the memory at a start of which nothing is known
 UNKNOWN = 0.5
 #: steps of a rough fit and of a finished one
@@ -207,14 +204,9 @@ class Search:
         rough += self._rough(self._inputs(alone.stage), alone.stage)
         first = min(rough, key=lambda one: one.loss)
         starts = linear_starts(self._inputs(first.stage), self.stretches, self.allowed, ORDERS)
-        idle = 0
         for (na, _), (d, G) in sorted(starts.items()):
             one = self._fit(_with_dynamics(first.stage, d, G), MANY)
-            least = min(c.price for c in found)
             found.append(self._candidate(f'order {na}', one))
-            idle = 0 if found[-1].price < least else idle + 1
-            if idle == IDLE:
-                break
         return found + self._later(best_of(found))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
