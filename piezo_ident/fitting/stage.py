@@ -14,7 +14,8 @@ of each stretch, and the memory at the start of each record,
     F_r(0) = v(0) - int_0^r m(r') dr',      0 <= m <= 1,
 
 with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
-begins with m = 0 and l = 0, as a simulation does: freed, both would take what H errs by.
+begins with m = 0 and l = 0, as a simulation does: freed, both would take what H errs by.  With
+`rested` false l is free there, too: a voltage at rest tells nothing of the creep of an earlier one.
 
 With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
 signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999), section 10.3.
@@ -81,6 +82,8 @@ class Stage:
         How far each element of creep is from its rest at the first sample.
     resting : ndarray of bool, shape (stretches,)
         Stretches that begin with all creep at rest.
+    rested : bool
+        Whether that holds where a record begins as a simulation does.
     starts, guesses : ndarray, shape (records, PARTS)
         Shares m of the memory, and what they are drawn to; guesses of zero are known.
     """
@@ -96,6 +99,7 @@ class Stage:
     resting: Mask
     starts: Array
     guesses: Array
+    rested: bool = True
 
     @classmethod
     def linear(
@@ -136,7 +140,7 @@ class Stage:
     def on_other(self, stretches: Sequence[Stretch]) -> Stage:
         """Return the stage for other stretches of the same records."""
         known = np.logical_not(self.guesses.any(axis=1))
-        resting = [bool(known[s.record]) and not s.before.size for s in stretches]
+        resting = [self.rested and bool(known[s.record]) and not s.before.size for s in stretches]
         lags = np.zeros((len(stretches), self.taus.size))
         return replace(self, lags=lags, resting=np.array(resting))
 

@@ -19,13 +19,13 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers, true_runs
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.free_run import Fit, fit
-from piezo_ident.fitting.stage import Stage
+from piezo_ident.fitting.stage import MOST_CREEP, Stage
 from piezo_ident.fitting.stretch import delayed, Stretch
 from piezo_ident.identification.step1_delay import MAX_DELAY
 from piezo_ident.identification.step2_dynamics import factor_of, stabilised
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.selection.comparison import best_of, Candidate, candidate, shown_effect
+from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect
 from scipy.signal import butter, sosfilt
 
 #: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
@@ -215,16 +215,37 @@ class Search:
         wide = HysteresisLaw('preisach', stage.law.thresholds, stage.law.span)
         found: list[Candidate] = []
         for name, trial in (
-            ('creep', stage.with_creep(taus, self.stretches)),
+            ('creep', self._crept(stage, taus)),
             ('preisach', stage.with_law(wide)),
-            ('preisach, creep', stage.with_law(wide).with_creep(taus, self.stretches)),
+            ('preisach, creep', self._crept(stage.with_law(wide), taus)),
         ):
             if len(found) == 2 and shown_effect(found, best) is None:
                 # creep alone brings nothing
                 break
             effects = int(trial.taus.size > 0)
             found.append(self._candidate(f'{best.name}, {name}', self._fit(trial, MANY), effects))
-        return found
+        return found + self._crept_before(found)
+
+    def _crept_before(self, found: Sequence[Candidate]) -> list[Candidate]:
+        """Return the best with creep, begun with creep of earlier motion, where that errs less."""
+        creeping = [c for c in found if c.effects]
+        known = min(creeping, key=lambda c: c.error)
+        if not known.fit.stage.resting.any():
+            return []
+        stage = replace(known.fit.stage, rested=False)
+        lags, stage = stage.lags, stage.on_other(self.stretches)
+        fit = self._fit(replace(stage, lags=lags), FEW)
+        free = self._candidate(f'{known.name} from before', fit, known.effects)
+        return [free] if ALIKE * free.error < known.error else []
+
+    def _crept(self, stage: Stage, taus: Array) -> Stage:
+        """Return a stage with creep, that of a pole of G and the zero beside it taken out of G."""
+        crept, G = stage.with_creep(taus, self.stretches), stage.dynamics
+        faster = G.without_slow_poles(1.0 / (2.0 * np.pi * taus[0]), self.stretches[0].rate)
+        share = abs(G.gain / faster.gain - 1.0)
+        if self.allowed.order is not None or not share <= MOST_CREEP * taus.size:
+            return crept
+        return replace(crept, dynamics=faster.normalised())
 
     def _later(self, best: Candidate) -> list[Candidate]:
         """Return what a first coefficient of B less and a sample of delay more leave, in turn."""

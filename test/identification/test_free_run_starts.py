@@ -137,3 +137,23 @@ def test_plays_in_the_middle_of_their_bands_are_no_start_as_of_a_simulation():
     best, _ = search.best()
     assert best.fit.rms < 2e-4
     assert_allclose(best.fit.stage.memory(stretch), -0.5 * law.thresholds, atol=0.05)
+
+
+def test_what_a_slow_pole_of_g_stood_for_becomes_creep():
+    rng = np.random.default_rng(5)
+    w = np.repeat(rng.uniform(0.0, 1.0, 60), 100).astype(float)
+    tau, share, rate = 0.4, 0.03, 100.0
+    lag = -np.expm1(-1.0 / rate / tau)
+    crept = signal.lfilter([0.0, lag], [1.0, lag - 1.0], w) * share + w
+    x = signal.lfilter([0.4], [1.0, -0.6], crept) + 1e-5 * rng.standard_normal(w.size)
+    block = np.arange(w.size) * 25 // w.size
+    stretch = Stretch(w, x, np.ones(w.size, dtype=bool), block, rate)
+    law = HysteresisLaw('plays', np.array([0.3]))
+    known, allowed = np.zeros((1, PARTS)), Allowed(delay=0)
+    search = Search([stretch], interleaved(25), None, law, known, allowed, lambda: None)
+    best, _ = search.best()
+    taus = np.array([0.1, 0.4])
+    creeping = search.wider(best, taus)[0].fit.stage
+    assert best.fit.stage.dynamics.radius > 0.95
+    assert creeping.dynamics.radius == pytest.approx(0.6, abs=0.05)
+    assert creeping.creep.sum() == pytest.approx(share, abs=2e-3)
