@@ -15,7 +15,7 @@ of each stretch, and the memory at the start of each record,
 
 with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
 begins with m = 0 and l = 0, as a simulation does: freed, both would take what H errs by.  With
-`rested` false l is free there, too: a voltage at rest tells nothing of the creep of an earlier one.
+`rested` false l is free there, too: a voltage at rest tells nothing of creep from before.
 
 With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
 signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999), section 10.3.
