@@ -74,4 +74,7 @@ def _is_edge(x: Array, own: Mask) -> bool:
     """Return whether a kind holds the least or the largest of any property."""
     mean = x[own].mean(axis=0)
     rest = x[~own]
+    if not rest.size:
+        # all blocks move alike
+        return True
     return bool(np.any(mean < rest.min(axis=0)) or np.any(mean > rest.max(axis=0)))

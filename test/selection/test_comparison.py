@@ -68,3 +68,10 @@ def test_one_kind_of_motion_has_no_kinds():
     t = np.arange(4000) / 1000.0
     assert motion_kinds([stretch([np.sin(2 * np.pi * 50.0 * t[:400])])], 4) is None
     assert set(interleaved(10)) == set(range(5))
+
+
+def test_blocks_that_all_move_alike_are_no_kinds():
+    t = np.arange(2000) / 1000.0
+    u, block = np.sin(2.0 * np.pi * 10.0 * t), np.arange(2000) // 100
+    stretch = Stretch(u, u, np.ones(u.size, dtype=bool), block, 1000.0)
+    assert motion_kinds([stretch], 20) is None
