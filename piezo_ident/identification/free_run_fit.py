@@ -33,7 +33,6 @@ from piezo_ident.identification.step3_hysteresis import (
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.suspicions import rises_first
-from piezo_ident.selection.comparison import best_of
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 #: samples of records that the search simulates whole, those of windows of longer ones, and rows
@@ -75,7 +74,8 @@ def fit_free_run(
     best, found = search.best()
     progress('dynamics', 0.7)
     found += tuple(search.wider(best, _taus(stretches)))
-    best = best_of(found)
+    best = search.at_rest(found)
+    found += (best,)
     progress('dynamics', 1.0)
     kept = _thinned(stretches)
     start = best.fit.stage

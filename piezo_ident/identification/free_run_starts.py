@@ -24,12 +24,14 @@ from piezo_ident.fitting.stretch import delayed, Stretch
 from piezo_ident.identification.step1_delay import MAX_DELAY
 from piezo_ident.identification.step2_dynamics import factor_of, stabilised
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
-from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect
 from scipy.signal import butter, sosfilt
 
 #: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
+#: laws of H that are tried beside sums of plays
+WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
 #: share of the memory at a start of which nothing is known
 UNKNOWN = 0.5
 #: steps of a rough fit and of a finished one
@@ -198,6 +200,25 @@ class Search:
         free = self._candidate('free start', self._fit(stage, FEW), 1)
         return best_of([one, free]) is free
 
+    def at_rest(self, found: Sequence[Candidate]) -> Candidate:
+        """
+        Return the best with its starts at rest again, if they are free and that errs no more.
+
+        They were freed beside an H of plays; a wider one may need no memory from before.
+        """
+        best = best_of(found)
+        if np.array_equal(best.fit.stage.guesses, self.guesses):
+            return best
+        wide = [c for c in found if c.fit.stage.law.name in WIDER]
+        rests = []
+        for one in dict.fromkeys([best, *wide]):
+            stage = replace(one.fit.stage, guesses=self.guesses, starts=self.guesses.copy())
+            fit = self._fit(stage.on_other(self.stretches), MANY)
+            rests.append(self._candidate(f'{one.name}, at rest', fit, one.effects))
+        free = replace(best, effects=best.effects + 1)
+        known = best_of([*rests, free])
+        return best if known is free else known
+
     def _orders(self, alone: Fit) -> list[Candidate]:
         found = [self._candidate('hysteresis', alone)]
         rough = [alone, *self._rough([s.u for s in self.stretches], None)]
@@ -210,25 +231,24 @@ class Search:
         return found + self._later(best_of(found))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
-        """Return the candidate with creep, with a wider law of H, and with both."""
+        """Return the candidate with creep, those with wider laws of H, and with both."""
         stage = best.fit.stage
-        wide = HysteresisLaw('preisach', stage.law.thresholds, stage.law.span)
-        found: list[Candidate] = []
-        for name, trial in (
-            ('creep', self._crept(stage, taus)),
-            ('preisach', stage.with_law(wide)),
-            ('preisach, creep', self._crept(stage.with_law(wide), taus)),
-        ):
-            if len(found) == 2 and shown_effect(found, best) is None:
-                # creep alone brings nothing
-                break
-            effects = int(trial.taus.size > 0)
-            found.append(self._candidate(f'{best.name}, {name}', self._fit(trial, MANY), effects))
-        return found + self._crept_before(found)
+        found = [self._more(best, 'creep', self._crept(stage, taus))]
+        laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
+        wider = [self._more(best, law.name, stage.with_law(law)) for law in laws]
+        if shown_effect(found, best) is not None:
+            law = min([best, *wider], key=lambda c: c.price).fit.stage.law
+            if law.name in WIDER:
+                crept = self._crept(stage.with_law(law), taus)
+                found.append(self._more(best, f'{law.name}, creep', crept))
+        return [*found, *wider, *self._crept_before(found)]
 
-    def _crept_before(self, found: Sequence[Candidate]) -> list[Candidate]:
+    def _more(self, best: Candidate, name: str, stage: Stage) -> Candidate:
+        effects = int(stage.taus.size > 0)
+        return self._candidate(f'{best.name}, {name}', self._fit(stage, MANY), effects)
+
+    def _crept_before(self, creeping: Sequence[Candidate]) -> list[Candidate]:
         """Return the best with creep, begun with creep of earlier motion, where that errs less."""
-        creeping = [c for c in found if c.effects]
         known = min(creeping, key=lambda c: c.error)
         if not known.fit.stage.resting.any():
             return []
