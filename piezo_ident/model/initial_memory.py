@@ -215,17 +215,17 @@ def crept(model: StageModel, start: Start) -> float:
     """Return what creep of earlier motion adds to the displacement at a start [m]."""
     if not start.creep.size:
         return 0.0
-    return float(model.scaling.Y * model.dynamics.gain * (_elements(model)[0] @ start.creep))
+    return float(model.scaling.Y * model.dynamics.gain * (creep_elements(model)[0] @ start.creep))
 
 
-def _elements(model: StageModel) -> NDArray[np.float64]:
+def creep_elements(model: StageModel) -> NDArray[np.float64]:
     """Return shares and time constants [s] of the creep of a model, shape (2, c)."""
     found = [e.parameters for e in model.effects if e.name == Creep.name]
     return np.array([found[0]['gain'], found[0]['time_constant']]) if found else np.empty((2, 0))
 
 
 def _creeps(model: StageModel) -> bool:
-    return bool(_elements(model)[0].any())
+    return bool(creep_elements(model)[0].any())
 
 
 def _branches(h: Hysteresis, u: float) -> NDArray[np.float64]:
@@ -255,7 +255,7 @@ def _fit(
     keep = keep[:: max(1, keep.size // 5000)]
     x = model.scaling.x(part.y)[keep]
     m, k = (h.thresholds.size, h.lag_range.shape[1]) if memory else (0, 0)
-    gains, times = _elements(model) if creep else np.empty((2, 0))
+    gains, times = creep_elements(model) if creep else np.empty((2, 0))
     c, z = gains.size, int(zero)
     rest = np.concatenate([h.initial_memory(u0)[:m], h.settled(u0)[:k], np.zeros(c + z)])
 

@@ -175,10 +175,14 @@ class StageModel:
     def _operators(self, slot: Slot) -> list[Operator]:
         return [find_effect(s.name)(self.sample_rate, s.parameters) for s in self.effects_in(slot)]
 
+    def input_chain(self) -> Chain:
+        """Return fresh operators of the effects of the input slot."""
+        return Chain(tuple(self._operators('input')))
+
     def hysteresis_input(self, piece: Piece) -> Array:
         """Return the normalised voltage behind the effects of the input slot, shape (n,)."""
         u = self.scaling.u(piece.v)
-        chain = Chain(tuple(self._operators('input')))
+        chain = self.input_chain()
         chain.reset(float(u[0]), float(u[0]))
         return chain.process(Block(t=piece.t, v=u, x=u, channels=piece.channels)).x
 

@@ -1,0 +1,280 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+An observer of the state: what the sensor says of that which the voltage alone does not tell.
+
+The free run of a model begins at rest.  A real stage still creeps from earlier motion, its sensor
+may have been set to another zero, and its plays stand where nobody saw them move.  In normalised
+units the displacement is that of the free run, plus
+
+    o  +  g sum_i c_i d_i  +  m,        d_i(k+1) = exp(-1 / (f_s tau_i)) d_i(k),
+
+where o is an offset that walks at random, d_i is how far an element of creep is from where the
+free run has it, c_i is its share and g = G(1).  m is the error of the model, correlated along the
+path of the voltage: at rest it stays as it is, and no time averages it out.  A Kalman filter
+follows o, d and m by the means of groups of samples.  `estimate` is the free run plus offset and
+creep; m is no part of it, since what the model lacks must show.
+
+Two hypotheses run side by side, weighed by their likelihood: the zero is where it was, and it is
+anywhere.  Slow creep and a zero look alike at first, and a wide prior of the zero alone would take
+all that creep leaves.
+
+Unknown outputs of plays are bounds, between which they start and which the voltage draws together;
+`MemoryBounds` has them.  What they add is part of the offset, which may change by as much as their
+band shrinks.
+
+Kalman filter: R. E. Kalman, "A new approach to linear filtering and prediction problems", J. Basic
+Engineering 82(1), 1960, doi:10.1115/1.3662552.  Weights of hypotheses: D. T. Magill, "Optimal
+adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control 10(4), 1965,
+doi:10.1109/TAC.1965.1098191.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError
+from piezo_ident.model import observer_kernel as kernel
+from piezo_ident.model.initial_memory import creep_elements
+from piezo_ident.model.memory_bounds import MemoryBounds
+from piezo_ident.model.metrics import expected_error
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.chain import Block
+from piezo_ident.record.record import Piece
+
+#: displacement comes so many samples later than the estimate that uses it: a block
+HORIZON = 100
+#: time over which displacement is averaged to one measurement [s]
+GROUP = 1e-3
+#: rms error of a model that holds none, and the smallest that is believed of one, in spans: that
+#: of the paper's model, and a tenth of a bit of its converters
+UNKNOWN, LEAST = 1e-2, 1e-6
+#: path of the voltage over which the error of a model changes, as a share of its range (taste:
+#: the misfit of H has a few waves over a stroke)
+PATH = 0.25
+#: rms change of the offset in a second, in spans: 100 nm in a minute of a span of 100 um, the
+#: faster thermal drifts
+WALK = 1e-3 / np.sqrt(60.0)
+#: rms size of the offset, in spans: a zero that was left alone, and one that is anywhere (taste)
+ZEROS = (1e-3, 1.0)
+#: rms size of d, as a share of the range of H: earlier motion was anywhere in it, equally likely
+BEYOND = 1.0 / np.sqrt(12.0)
+#: deviation beyond which a measurement is no information, in standard deviations (taste)
+GATE = 5.0
+#: time for which what is beyond it must last until it is believed [s]
+PATIENCE = 5.0
+#: time for which displacement is refused until that is said [s]
+DOUBT = 0.2
+#: share of the range that counts as its lower end, where the memory is known
+REST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """
+    What an observer says of some samples, shapes (n,), in metres.
+
+    Attributes
+    ----------
+    estimate, std : ndarray
+        Displacement, and the standard deviation of its error.
+    offset, offset_std : ndarray
+        Part of the estimate that the free run lacks and that stays, plays that have not moved
+        since the start included, and its standard deviation.
+    creep, creep_std : ndarray
+        The same of creep from earlier motion.
+    band : ndarray
+        What plays of unknown output may still change of the offset as the voltage moves on.
+    """
+
+    estimate: Array
+    std: Array
+    offset: Array
+    offset_std: Array
+    creep: Array
+    creep_std: Array
+    band: Array
+
+
+class Observer:
+    """
+    Follows what the free run of a model lacks, by displacement that comes a horizon later.
+
+    The result does not depend on how a stream is cut.
+
+    Parameters
+    ----------
+    model : StageModel
+    horizon : int, optional
+        Samples by which displacement is older than the estimate that uses it.
+    error, noise : float, optional
+        Rms error of the model, and of the sensor [m]; by default the error that the model holds,
+        of which noise is a part.
+    zeros : tuple of float, optional
+        Size of the offset [m, rms] by each hypothesis.
+    gate : float, optional
+        Standard deviations beyond which a measurement is first not believed.
+    known : bool, optional
+        Whether the free run has the memory of the plays; else it does at the lowest voltage alone.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        *,
+        horizon: int = HORIZON,
+        error: float | None = None,
+        noise: float | None = None,
+        zeros: tuple[float, ...] | None = None,
+        gate: float = GATE,
+        known: bool = False,
+    ) -> None:
+        if horizon < 1:
+            raise DataError(f'observer: the horizon is at least one sample, got {horizon}')
+        self.model, self.horizon = model, horizon
+        span, known = abs(model.scaling.Y), expected_error(model)
+        held = UNKNOWN if known is None else known / 100.0
+        size = max(held if error is None else error / span, LEAST)
+        noisy = size if noise is None else max(noise / span, LEAST)
+        self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
+        self._law = self._laws(size, noisy, gate)
+        low, high = model.scaling.u(model.scaling.range).tolist()
+        self._width = high - low
+        self._input = model.input_chain()
+        self._bounds = MemoryBounds(model.hysteresis, low, (low, high))
+        self._is_known, self._started, self._is_lost = known, False, False
+
+    def _laws(self, error: float, noise: float, gate: float) -> kernel.Law:
+        model, rate = self.model, self.model.sample_rate
+        gains, times = creep_elements(model)
+        size = max(1, round(GROUP * rate))
+        left = np.exp(-1.0 / (rate * times))
+        before = left[:, None] ** -np.arange(size)
+        gains = model.dynamics.gain * gains
+        groups = max(1.0, PATIENCE * rate / size)
+        growth = 1.0 / groups if gate < np.inf else 0.0
+        walk = WALK**2 * size / rate
+        # in the order of their places
+        numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, ZEROS[-1] ** 2]
+        return kernel.Law(
+            row=np.concatenate([[1.0], gains * before.mean(axis=1), [1.0]]),
+            lead=gains * left**self.horizon,
+            left=left,
+            kept=np.append(1.0, left**size),
+            numbers=np.array(numbers),
+        )
+
+    def _start(self, u0: float) -> None:
+        law, h = self._law, self.model.hysteresis
+        n, count = law.row.size, self._zeros.size
+        reach = BEYOND * float(np.ptp(h(np.linspace(*h.span, 65))))
+        P = np.zeros((count, n, n))
+        for b, zero in enumerate(self._zeros):
+            P[b] = np.diag([zero**2, *[reach**2] * (n - 2), law.numbers[kernel.ERROR]])
+        now = np.zeros(15)
+        now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
+        size = max(1, round(GROUP * self.model.sample_rate))
+        group, coming = np.full(size, np.nan), np.zeros(law.left.size)
+        self._state = kernel.State(np.zeros((count, n)), P, np.zeros(count), group, coming, now)
+        kernel.tell(law, self._state)
+        self._input.reset(u0, u0)
+        low = float(self.model.scaling.u(self.model.scaling.range[0]))
+        if self._is_known or u0 - low < REST * self._width:
+            self._bounds.came_down(u0)
+        else:
+            self._bounds.forget(u0)
+        self._count, self._last, self._started = 0, u0, True
+        self._past: Array | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether the voltage so far tells the outputs of all plays."""
+        return self._started and not self._is_lost and bool(self._bounds.known.all())
+
+    @property
+    def is_refusing(self) -> bool:
+        """Whether displacement comes that is not believed, or is stuck."""
+        if not self._started:
+            return False
+        return bool(self._state.now[kernel.REFUSED] * GROUP >= DOUBT)
+
+    def lose_memory(self) -> None:
+        """Take note that voltage was lost before the next sample."""
+        self._is_lost = True
+
+    def process(self, v: Array, free: Array, measured: Array) -> Observed:
+        """
+        Return the estimate of the next samples; all shapes (n,).
+
+        Parameters
+        ----------
+        v : ndarray
+            Voltage [V].
+        free : ndarray
+            Free run of the model under it [m].
+        measured : ndarray
+            Displacement of `horizon` samples before each [m], NaN where there is none.
+        """
+        scaling, g = self.model.scaling, abs(self.model.dynamics.gain)
+        u = scaling.u(v)
+        if not self._started:
+            self._start(float(u[0]))
+        time = (self._count + np.arange(u.size)) / self.model.sample_rate
+        self._count += u.size
+        u = self._input.process(Block(t=time, v=u, x=u)).x
+        if self._is_lost:
+            self._bounds.forget(float(u[0]))
+            self._is_lost = False
+        band = g * self._bounds.follow(u)
+        path = np.abs(np.diff(u, prepend=self._last)) / self._width
+        self._last = float(u[-1])
+        new = np.stack([scaling.x(free), path, band])
+        if self._past is None:
+            # there is nothing to see before the start
+            self._past = np.full((3, self.horizon), np.nan)
+            self._state.now[kernel.BAND] = band[0]
+        whole = np.concatenate([self._past, new], axis=1)
+        before, self._past = whole[:, : u.size].copy(), whole[:, u.size :]
+        out, y = np.empty((6, u.size)), scaling.x(measured)
+        kernel.follow(y, before[0], before[1], before[2], self._law, self._state, out)
+        Y = scaling.Y
+        return Observed(
+            estimate=free + Y * out[0],
+            std=abs(Y) * out[1],
+            offset=Y * out[2],
+            offset_std=abs(Y) * out[3],
+            creep=Y * out[4],
+            creep_std=abs(Y) * out[5],
+            band=abs(Y) * band,
+        )
+
+
+def observe(model: StageModel, piece: Piece, horizon: int = HORIZON, **options: Any) -> Observed:
+    """
+    Return what an observer says along a record, whose readings that are no numbers are missing.
+
+    Parameters
+    ----------
+    model : StageModel
+    piece : Piece
+    horizon : int, optional
+        As of `Observer`, and its other parameters.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> (piece,) = stage.play(pi.Program.load('minor_loops'))
+    >>> moved = Piece(piece.v, piece.y + 1e-6, piece.sample_rate)
+    >>> seen = observe(stage.model, moved)
+    >>> f'{1e6 * seen.offset[-1]:.2f} um'
+    '1.00 um'
+    """
+    model.check_rate(piece)
+    y = np.concatenate([np.full(horizon, np.nan), piece.y])[: piece.n]
+    observer = Observer(model, horizon=horizon, **options)
+    return observer.process(piece.v, model.stream().follow(piece), y)

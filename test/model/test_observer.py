@@ -1,0 +1,299 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The observer of the state: what would prove it wrong."""
+
+from dataclasses import replace
+import time
+
+import numpy as np
+from numpy.testing import assert_allclose
+from paper_stage import FS, PAPER
+from piezo_ident.model.initial_memory import creep_elements
+from piezo_ident.model.memory_bounds import MemoryBounds
+from piezo_ident.model.observer import BEYOND, observe, Observer, PATH, WALK, ZEROS
+from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.model.stream import Start
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis_law import LAWS
+from piezo_ident.operators.play import play_columns
+from piezo_ident.record.record import Piece
+import pytest
+from random_models import random_hysteresis
+
+SPAN = abs(PAPER.scaling.Y)
+#: a slow rate keeps long motions cheap
+SLOW_RATE = 1000.0
+TIMES = np.array([0.1, 1.0, 10.0, 100.0])
+
+
+def creeping(rate=SLOW_RATE, gains=0.012, times=TIMES, h=PAPER.hysteresis):
+    """Return a model with creep and without dynamics, so that any rate will do."""
+    creep = {'gain': np.full(times.size, gains), 'time_constant': times}
+    static = PAPER.without_dynamics()
+    gain = static.dynamics.b[0]
+    dynamics = replace(static.dynamics, b=static.dynamics.b / gain)
+    h = replace(h, weights=h.weights * gain, p1=h.p1 * gain, p2=h.p2 * gain)
+    return replace(
+        static,
+        sample_rate=rate,
+        hysteresis=h,
+        dynamics=dynamics,
+        effects=(EffectSetting('creep', creep),),
+    )
+
+
+def moved(n, rate=SLOW_RATE, frequency=0.7, low=0.0, high=10.0):
+    t = np.arange(n) / rate
+    return low + 0.5 * (high - low) * (1.0 - np.cos(2 * np.pi * frequency * t))
+
+
+def with_noise(y, size, seed=0):
+    return y + size * np.random.default_rng(seed).standard_normal(y.size)
+
+
+def shifted(y, horizon):
+    return np.concatenate([np.full(horizon, np.nan), y])[: y.size]
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def textbook(model, v, y, noise, error, horizon):
+    """Return the correction by a Kalman filter with full matrices, sample after sample."""
+    gains, times = creep_elements(model)
+    n = 2 + gains.size
+    a = np.exp(-1.0 / (model.sample_rate * times))
+    u = model.scaling.u(v)
+    e = model.scaling.x(y) - model.scaling.x(model.stream().process(v))
+    path = np.abs(np.diff(u, prepend=u[0]))
+    reach = BEYOND * np.ptp(model.hysteresis(np.linspace(0.0, 1.0, 65)))
+    x, P = np.zeros(n), np.diag([ZEROS[1] ** 2, *[reach**2] * (n - 2), error**2])
+    H = np.array([[1.0, *gains, 1.0]])
+    ahead = np.array([1.0, *gains * a**horizon, 0.0])
+    out = np.zeros(v.size)
+    for k in range(v.size - horizon):
+        phi = np.exp(-path[k] / PATH)
+        F = np.diag([1.0, *a, phi])
+        Q = np.zeros((n, n))
+        Q[0, 0], Q[-1, -1] = WALK**2 / model.sample_rate, error**2 * (1.0 - phi**2)
+        x, P = F @ x, F @ P @ F.T + Q
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + noise**2)
+        x, P = x + K @ (e[k] - H @ x), (np.eye(n) - K @ H) @ P
+        out[k + horizon] = ahead @ x
+    return out
+
+
+def test_the_linear_case_is_the_kalman_filter_of_the_textbook():
+    model, n, horizon = creeping(), 3000, 7
+    v = moved(n)
+    y = with_noise(model.simulate(v, start=Start(creep=np.array([0.4, -0.2, 0.3, 0.1]))), 1e-8)
+    seen = observe(
+        model, Piece(v, y, SLOW_RATE), horizon, error=75e-9, noise=1e-8, zeros=(SPAN,), gate=np.inf
+    )
+    expected = textbook(model, v, y, 1e-8 / SPAN, 1e-3, horizon)
+    found = (seen.estimate - model.simulate(v)) / SPAN
+    assert_allclose(found, expected, rtol=0, atol=1e-10)
+    assert np.ptp(expected) > 1e-3
+
+
+def test_bounds_hold_the_truth():
+    rng = np.random.default_rng(1)
+    known = 0
+    for _ in range(10_000):
+        r = np.sort(rng.uniform(0.0, 1.2, 5))
+        v = np.cumsum(rng.normal(0.0, rng.choice([0.05, 0.4]), 30))
+        v = np.abs((v % 2.0) - 1.0)
+        k = rng.integers(1, 20)
+        before = play_columns(np.concatenate([[0.0], v[:k]]), r)[:, -1]
+        truth = play_columns(v[k:], r, before)[:, -1]
+        bounds = MemoryBounds(Hysteresis(r, np.ones(5), 0.0, 1.0), v[k], (0.0, 1.0))
+        bounds.follow(v[k:])
+        assert np.all(bounds.low <= truth) and np.all(truth <= bounds.high)
+        # every play is known once the voltage has moved by its width
+        assert np.all(bounds.known[r <= np.ptp(v[k:]) - 1e-12])
+        known += bounds.known.sum()
+    assert 10_000 < known < 49_000
+
+
+@pytest.mark.parametrize('law', LAWS)
+def test_the_band_holds_the_output_of_any_law(law):
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        h = random_hysteresis(rng, law)
+        v = np.clip(
+            np.interp(np.arange(2000), np.arange(0, 2001, 100), rng.uniform(0, 1, 21)), 0, 1
+        )
+        k = 700
+        _, memory = h.follow(v[:k], h.initial_memory(v[0]))
+        truth, _ = h.follow(v[k:], memory)
+        bounds = MemoryBounds(h, v[k - 1], (0.0, 1.0))
+        low, _ = h.follow(v[k:], bounds.low)
+        band = bounds.follow(v[k:])
+        assert np.all(truth - low >= -1e-12) and np.all(truth - low <= band + 1e-12)
+
+
+def test_without_displacement_there_is_no_correction():
+    model = creeping()
+    for v in (np.full(2000, 5.0), moved(2000)):
+        seen = observe(model, Piece(v, np.full(v.size, np.nan), SLOW_RATE))
+        assert np.array_equal(seen.estimate, model.stream().process(v))
+        # and it knows less, not more
+        assert np.all(np.diff(seen.offset_std) >= -1e-18)
+
+
+def test_a_sensor_that_is_stuck_moves_the_estimate_no_more():
+    model, n, cut = creeping(), 8000, 4000
+    v = moved(n)
+    truth = model.simulate(v)
+    y = with_noise(truth, 1.5e-9)
+    y[cut:] = y[cut]
+    seen = observe(model, Piece(v, y, SLOW_RATE), error=1e-4 * SPAN)
+    assert rms((seen.estimate - truth)[cut:]) < 1e-3 * SPAN
+    assert np.ptp(truth[cut:]) > 0.9 * SPAN * 0.9
+
+
+def after_earlier_motion(model, v, seed=0, noise=1.5e-9):
+    """Return truth and reading along v of a stage that was at the top for two seconds before."""
+    before = np.concatenate(
+        [np.linspace(0, 10, 500), np.full(2000, 10.0), np.linspace(10, 0, 500)]
+    )
+    truth = model.simulate(np.concatenate([before, v]))[before.size :]
+    return truth, with_noise(truth, noise, seed)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_cut_off_from_the_sensor_it_goes_on_better_than_what_it_must_beat(seed):
+    model, n, cut = creeping(), 6000, 3000
+    v = np.concatenate([np.zeros(500), moved(n - 500, frequency=1.3, high=1.0 + seed)])
+    truth, y = after_earlier_motion(model, v, seed)
+    reading = y.copy()
+    reading[cut:] = np.nan
+    seen = observe(model, Piece(v, reading, SLOW_RATE), error=1e-4 * SPAN)
+    late = slice(cut, cut + 1000)
+    free = rms((model.simulate(v) - truth)[late])
+    held = rms((y[cut - 1] - truth)[late])
+    own = rms((seen.estimate - truth)[late])
+    assert own < 0.1 * free and own < 0.1 * held
+    # the sensor may not be copied: what it reads now is no part of the estimate of now
+    assert rms((seen.estimate - y)[1000:cut]) > 1.0e-9
+
+
+def test_it_beats_the_free_run_on_a_stage_that_creeps_as_the_logarithm_of_time():
+    # made by hand: after a step by s the stage goes on by gamma s log10(1 + t / t0)
+    rate, n = SLOW_RATE, 10_000
+    model = creeping()
+    hold = 4000
+    v = np.concatenate([np.zeros(100), moved(n - 100, frequency=0.5, high=4.0)])
+    t = np.arange(n) / rate
+    base = model.without_dynamics().simulate(v)
+    gamma, t0 = 0.03, 0.05
+    # up to 10 V for four seconds, and down again, before the stream
+    creep = gamma * SPAN * 0.9 * (np.log10(1.0 + (t + hold / rate) / t0) - np.log10(1.0 + t / t0))
+    steps = np.diff(base, prepend=base[0])
+    law = gamma * np.log10(1.0 + np.arange(n) / rate / t0)
+    truth = base + creep + np.fft.irfft(np.fft.rfft(steps, 2 * n) * np.fft.rfft(law, 2 * n))[:n]
+    y = with_noise(truth, 3e-9)
+    cut = 7000
+    y[cut:] = np.nan
+    seen = observe(model, Piece(v, y, rate), error=2e-3 * SPAN)
+    free = model.simulate(v)
+    live, late = slice(500, cut), slice(cut, cut + 1000)
+    for part, factor in ((live, 3.0), (late, 3.0)):
+        assert rms((free - truth)[part]) > factor * rms((seen.estimate - truth)[part])
+    # what it claims holds the truth
+    inside = np.abs(seen.estimate - truth) < 2.0 * seen.std
+    assert np.mean(inside[500:]) > 0.85
+
+
+def test_the_result_depends_neither_on_cuts_nor_on_what_comes_later():
+    model, n = creeping(), 4000
+    v = np.concatenate([moved(n)[700:], moved(700)])
+    _, y = after_earlier_motion(model, v)
+    whole = observe(model, Piece(v, y, SLOW_RATE))
+    observer, stream, measured = Observer(model), model.stream(), shifted(y, 100)
+    rng, start, parts = np.random.default_rng(3), 0, []
+    while start < n:
+        cut = slice(start, start + int(rng.integers(1, 300)))
+        parts.append(observer.process(v[cut], stream.process(v[cut]), measured[cut]))
+        start = cut.stop
+    for name in ('estimate', 'std', 'offset', 'creep', 'band'):
+        found = np.concatenate([getattr(part, name) for part in parts])
+        assert_allclose(found, getattr(whole, name), rtol=0, atol=1e-12 * SPAN)
+    # displacement from now on changes nothing up to a horizon later
+    y[2000:] += 1e-6
+    other = observe(model, Piece(v, y, SLOW_RATE))
+    assert np.array_equal(other.estimate[:2100], whole.estimate[:2100])
+    assert not np.array_equal(other.estimate[2100:], whole.estimate[2100:])
+
+
+def test_lost_readings_and_outliers_leave_it_going_and_less_sure():
+    model, n = creeping(20_000.0), 60_000
+    v = moved(n, 20_000.0, frequency=2.0)
+    truth = model.simulate(v)
+    y = with_noise(truth + 0.3e-6, 1.5e-9)
+    rng = np.random.default_rng(4)
+    y[rng.random(n) < 0.02] = 5e-5
+    y[rng.random(n) < 0.3] = np.nan
+    y[30_000:50_000] = np.nan
+    seen = observe(model, Piece(v, y, 20_000.0), error=1e-4 * SPAN)
+    assert rms((seen.estimate - truth - 0.3e-6)[5000:]) < 2e-4 * SPAN
+    assert np.all(np.diff(seen.offset_std[30_200:49_900]) >= 0.0)
+    assert seen.std[50_000] > seen.std[30_100] and seen.std[-1] < seen.std[50_000]
+
+
+def test_a_zero_that_moves_is_followed_only_if_it_lasts():
+    model, n = creeping(), 20_000
+    v = moved(n)
+    truth = model.simulate(v)
+    y = with_noise(truth, 1.5e-9)
+    y[5000:5300] += 1e-6
+    y[8000:] += 1e-6
+    seen = observe(model, Piece(v, y, SLOW_RATE), error=1e-4 * SPAN)
+    offset = seen.estimate - truth
+    assert np.abs(offset[5000:12_900]).max() < 1e-4 * SPAN
+    assert np.abs(offset[13_500:] - 1e-6).max() < 0.1e-6
+
+
+def test_in_midstream_it_soon_errs_no_more_than_with_its_memory_known():
+    h = Hysteresis(np.linspace(0.05, 0.9, 12), np.full(12, 0.04), -0.1, 0.6)
+    model, n = creeping(h=h), 5000
+    for bias, swing in ((5.0, 2.0), (7.0, 4.0), (3.0, 1.0)):
+        before = np.concatenate([moved(1500, high=10.0), moved(1500, high=8.0)])
+        to = np.linspace(before[-1], bias - swing / 2, 200)
+        v = moved(n, frequency=2.0, low=bias - swing / 2, high=bias + swing / 2)
+        path = np.concatenate([before, to, v])
+        truth = model.simulate(path)[-n:]
+        y = with_noise(truth, 1.5e-9)
+        seen = observe(model, Piece(v, y, SLOW_RATE), error=1e-4 * SPAN)
+        after = slice(600, None)
+        assert rms((model.stream().process(v) - truth)[after]) > 1e-3 * SPAN
+        assert rms((seen.estimate - truth)[after]) < 1e-4 * SPAN
+        assert seen.band[0] > seen.band[-1] > 0.0
+        # the voltage goes on where it was not yet: the band says by how much it may err
+        wide = np.concatenate([v, moved(2000, frequency=0.5, low=v[-1], high=10.0)])
+        truth = model.simulate(np.concatenate([before, to, wide]))[-wide.size :]
+        y = with_noise(truth, 1.5e-9)
+        y[n:] = np.nan
+        seen = observe(model, Piece(wide, y, SLOW_RATE), error=1e-4 * SPAN)
+        assert np.all(np.abs(seen.estimate - truth)[n:] < seen.band[n - 1] + 5e-4 * SPAN)
+
+
+def test_it_takes_at_most_two_microseconds_a_sample():
+    h = Hysteresis(np.linspace(0.01, 0.99, 40), np.full(40, 0.01), 0.0, 0.6)
+    model, n = creeping(FS, 0.005, np.geomspace(0.01, 1000, 10), h), 200_000
+    v = moved(n, FS, 5.0, 4.0, 5.0)
+    free = model.simulate(v)
+    measured = shifted(with_noise(free, 1e-9), 100)
+    best = np.inf
+    for _ in range(3):
+        observer = Observer(model)
+        begin = time.process_time()
+        for k in range(0, n, 100):
+            cut = slice(k, k + 100)
+            observer.process(v[cut], free[cut], measured[cut])
+        best = min(best, (time.process_time() - begin) / n)
+        assert not observer.known
+    print(f'{1e6 * best:.2f} us a sample')
+    assert best < 4e-6  # twice what it is to take, on a machine that is busy
