@@ -16,12 +16,14 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind
+from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples, time_problem
+from piezo_ident.record.record import Piece
 
 #: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
 BRIDGE = 0.5
@@ -220,3 +222,4 @@ def warm_up() -> None:
     predictor.process(Samples(t, t))
     predictor.set_model(model)
     TurningPoints().add(t, t)
+    observe(model, Piece(t, t, model.sample_rate))

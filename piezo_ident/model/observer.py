@@ -67,8 +67,6 @@ BEYOND = 1.0 / np.sqrt(12.0)
 GATE = 5.0
 #: time for which what is beyond it must last until it is believed [s]
 PATIENCE = 5.0
-#: time for which displacement is refused until that is said [s]
-DOUBT = 0.2
 #: share of the range that counts as its lower end, where the memory is known
 REST = 0.01
 
@@ -136,8 +134,8 @@ class Observer:
         if horizon < 1:
             raise DataError(f'observer: the horizon is at least one sample, got {horizon}')
         self.model, self.horizon = model, horizon
-        span, known = abs(model.scaling.Y), expected_error(model)
-        held = UNKNOWN if known is None else known / 100.0
+        span, percent = abs(model.scaling.Y), expected_error(model)
+        held = UNKNOWN if percent is None else percent / 100.0
         size = max(held if error is None else error / span, LEAST)
         noisy = size if noise is None else max(noise / span, LEAST)
         self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
@@ -194,13 +192,6 @@ class Observer:
     def known(self) -> bool:
         """Whether the voltage so far tells the outputs of all plays."""
         return self._started and not self._is_lost and bool(self._bounds.known.all())
-
-    @property
-    def is_refusing(self) -> bool:
-        """Whether displacement comes that is not believed, or is stuck."""
-        if not self._started:
-            return False
-        return bool(self._state.now[kernel.REFUSED] * GROUP >= DOUBT)
 
     def lose_memory(self) -> None:
         """Take note that voltage was lost before the next sample."""

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model beside the stage: prediction, residual and preview as blocks come."""
+"""The model beside the stage: prediction, residual, estimate and preview as blocks come."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
+from piezo_ident.live.corrector import Corrector, Estimated
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
@@ -24,7 +25,18 @@ from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual')
+QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
+#: what the observer tells on `corrections`, and of which of its numbers
+CORRECTIONS = {
+    'offset/value': 'offset',
+    'offset/std': 'offset_std',
+    'creep/value': 'creep',
+    'creep/std': 'creep_std',
+    'memory/band': 'band',
+    'estimate/std': 'std',
+}
+#: share of the span by which the band of unknown plays may shrink in a block that is judged
+SETTLED = 1e-5
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4
 #: share of the predictions of a second that must meet a displacement, and for how many seconds
@@ -43,6 +55,11 @@ class ModelNode(LabNode):
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
+        self._corrector, self._estimates = Corrector(self.values['horizon']), Matcher()
+        # of the estimate, and what was corrected last
+        self._left, self._corrected = LiveError(self.values['window']), ''
+        self._seen: dict[str, float] = {}
+        self._bin = -1
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
@@ -55,6 +72,8 @@ class ModelNode(LabNode):
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
+        self._estimate = self.create_publisher(Float64MultiArray, 'estimate', STREAM)
+        self._corrections = self.create_publisher(JointState, 'corrections', PREVIEW)
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
         if path := self.values['model']:
             self._loader.begin_with(path)
@@ -74,12 +93,15 @@ class ModelNode(LabNode):
         if path := changed.get('model'):
             self._loader.load_file(path)
         if 'window' in changed:
-            self._error.window = changed['window']
+            self._error.window = self._left.window = changed['window']
+        if 'horizon' in changed:
+            self._corrector.set_horizon(changed['horizon'])
 
     def _take_model(self, model: StageModel | None, source: str) -> None:
         try:
             if model is not None:
                 self._predictor.set_model(model)
+                self._corrector.set_model(model)
         except PiezoIdentError as error:
             model, source = None, f'{source}: {error}'
         if model is None:
@@ -91,7 +113,11 @@ class ModelNode(LabNode):
         if self._models > 1:
             # the state stays what it was
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
+        self._forget_errors()
+
+    def _forget_errors(self) -> None:
         self._error.clear()
+        self._left.clear()
 
     # blocks
 
@@ -109,9 +135,9 @@ class ModelNode(LabNode):
 
     def _voltage(self, samples: Samples) -> None:
         predictor = self._predictor
-        predictor.problem = ''
+        predictor.problem, known = '', predictor.memory_known
         prediction = predictor.process(samples)
-        if predictor.memory_lost:
+        if self._is_lost:
             # what was found before says nothing of now
             self._error.clear()
         if prediction is not None:
@@ -126,6 +152,7 @@ class ModelNode(LabNode):
             self._predicted += prediction.t.size
             self._publish_preview(self._preview.add('prediction', prediction.t, prediction.values))
             self._compare(self._matcher.predicted(prediction))
+            self._correct(self._corrector.predicted(prediction, samples, known))
 
     def _displacement(self, samples: Samples) -> None:
         usable = np.isfinite(samples.values)
@@ -139,6 +166,7 @@ class ModelNode(LabNode):
         self._measured += samples.t.size
         self._publish_preview(self._preview.add('displacement', samples.t, samples.values))
         if self._predictor.model is not None:
+            self._left_by(self._estimates.measured(samples))
             self._compare(self._matcher.measured(samples))
 
     def _compare(self, pairs: list[Matched]) -> None:
@@ -149,8 +177,42 @@ class ModelNode(LabNode):
             self._compared += residual.t.size
             self._residual.publish(to_message(residual))
             self._publish_preview(self._preview.add('residual', residual.t, residual.values))
-            if self._predictor.memory_known:
+            if self._is_known:
                 self._error.add(residual.t, residual.values, stroke, pair.y)
+            self._correct(self._corrector.measured(pair.t, pair.y))
+
+    @property
+    def _is_known(self) -> bool:
+        """Whether the memory of the plays is known, from rest or from sweeps."""
+        observer = self._corrector.observer
+        return self._predictor.memory_known or (observer is not None and observer.known)
+
+    @property
+    def _is_lost(self) -> bool:
+        """Whether blocks arrive and the memory of the plays is not known."""
+        return self._predictor.memory_lost and not self._is_known
+
+    def _correct(self, several: list[Estimated]) -> None:
+        stroke = abs(self._corrector.span)
+        for one in several:
+            samples, seen = one.samples, one.seen
+            self._estimate.publish(to_message(samples))
+            self._publish_preview(self._preview.add('estimate', samples.t, samples.values))
+            bins = np.floor(samples.t * self._preview.rate + 1e-6).astype(np.int64)
+            for k in np.flatnonzero(np.diff(bins, prepend=self._bin)).tolist():
+                self._seen = {n: float(getattr(seen, x)[k]) for n, x in CORRECTIONS.items()}
+                message = JointState(name=list(self._seen), position=list(self._seen.values()))
+                message.header.stamp = self.get_clock().now().to_msg()
+                self._corrections.publish(message)
+            self._bin = int(bins[-1])
+            # while plays become known what is left is a matter of them
+            if np.ptp(seen.band) <= SETTLED * stroke:
+                self._left_by(self._estimates.predicted(samples))
+
+    def _left_by(self, pairs: list[Matched]) -> None:
+        for pair in pairs:
+            left = pair.residual
+            self._left.add(left.t, left.values, self._corrector.span, pair.y)
 
     def _publish_preview(self, bins: list[PreviewBin]) -> None:
         for b in bins:
@@ -173,21 +235,24 @@ class ModelNode(LabNode):
 
     def _verdict(self) -> str:
         """Return why the stage should be identified again, empty when there is no reason."""
-        model = self._predictor.model
-        if model is None or self._error.seconds < 0.5 * self._error.window:
+        model, ratio = self._predictor.model, self.values['warn_ratio']
+        self._corrected = ''
+        if model is None or self._left.seconds < 0.5 * self._left.window:
             return ''
-        before, now = expected_error(model), self._live_error(model)
-        ratio = self.values['warn_ratio']
-        if before is None or now <= ratio * before:
+        before, span = expected_error(model), abs(model.scaling.Y)
+        left = percent(np.fmin(self._left.rms, self._error.rms), span)
+        if before is None:
             return ''
-        said = f'{now:.3g} % of stroke, {now / before:.1f} times that at identification'
-        mean = percent(self._error.mean, abs(model.scaling.Y))
-        if now**2 - mean**2 <= (ratio * before) ** 2:
-            return (
-                f'the displacement is a constant {mean:+.3g} % of stroke off the prediction, as '
-                f'creep from motion before the stream leaves it, or a zero that moved: {said}'
-            )
-        return f'identify again, or diagnose on this motion: the live error is {said}'
+        if left > ratio * before:
+            said = f'{left:.3g} % of stroke, {left / before:.1f} times that at identification'
+            return f'identify again, or diagnose on this motion: the live error is {said}'
+        if self._error.seconds and self._live_error(model) > ratio * before:
+            offset, creep = (self._seen.get(f'{x}/value', 0.0) for x in ('offset', 'creep'))
+            parts = [f'offset {1e6 * offset:+.2g} um']
+            if abs(creep) > 1e-4 * span:
+                parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
+            self._corrected = f'corrected: {", ".join(parts)}'
+        return ''
 
     def _left_out(self) -> str:
         n = self._error.outliers
@@ -199,12 +264,12 @@ class ModelNode(LabNode):
         self._predicted = self._measured = self._compared = 0
         if self._count and not predicted:
             # displacement is not to blame
-            self._error.clear()
+            self._forget_errors()
             return self._predictor.problem
         self._unmet = self._unmet + 1 if compared < MET * predicted else 0
         if self._unmet <= PATIENCE:
             return ''
-        self._error.clear()
+        self._forget_errors()
         if not measured:
             return 'no displacement comes'
         share = 100.0 * compared / predicted
@@ -219,7 +284,7 @@ class ModelNode(LabNode):
         problems = [self._refusal, *self._problems, self._left_out()]
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
-        if self._predictor.model is not None and self._predictor.memory_lost:
+        if self._predictor.model is not None and self._is_lost:
             message += '; its memory is unknown until the voltage has been at its lowest'
         text = '; '.join(filter(None, [message, *problems]))
         level = WARN if any(problems) else OK
@@ -253,16 +318,19 @@ class ModelNode(LabNode):
         model = p.model
         if model is None:
             return OK, 'no model yet', values
-        values['memory_known'] = p.memory_known
+        values['memory_known'] = self._is_known
         values['residual_rms'] = f'{self._error.rms:.6g}'
         values['residual_percent'] = f'{self._live_error(model):.4g}'
         values['residual_mean'] = f'{self._error.mean:.6g}'
         values['outliers'] = self._error.outliers
+        values['estimate_rms'] = f'{self._left.rms:.6g}'
+        values['estimate_percent'] = f'{percent(self._left.rms, self._corrector.span):.4g}'
+        values |= {name: f'{x:.6g}' for name, x in self._seen.items()}
         problems = [mismatch or self._verdict(), self._left_out()]
         if again:
             about = 'samples of displacement came again or out of turn: do two nodes publish it?'
             problems.append(f'{again} {about}')
-        if p.memory_lost:
+        if self._is_lost:
             problems.append('the memory is unknown until the voltage has been at its lowest')
         if low <= high:
             room = min(low - model.scaling.range[0], model.scaling.range[1] - high)
@@ -270,7 +338,8 @@ class ModelNode(LabNode):
             if room < -1e-3 * (model.scaling.range[1] - model.scaling.range[0]):
                 problems.append(f'the voltage leaves the identified range by {-room:.3g} V')
         message = '; '.join(filter(None, problems))
-        return (WARN, message, values) if message else (OK, 'predicting', values)
+        told = '; '.join(filter(None, [message or 'predicting', self._corrected]))
+        return WARN if message else OK, told, values
 
     def close(self) -> None:
         """Wake nobody any more."""

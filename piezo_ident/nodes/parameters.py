@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from piezo_ident.model.observer import HORIZON
+
 #: topics of blocks of samples, and of texts that a node that comes late must still hear
 SAMPLE_TOPICS = (
     'voltage',
@@ -19,6 +21,7 @@ SAMPLE_TOPICS = (
     'applied_voltage',
     'prediction',
     'residual',
+    'estimate',
     'reference',
     'tracking_error',
 )
@@ -188,7 +191,23 @@ MODEL = (
         1000.0,
     ),
     Declaration('window', 2.0, 'time over which the live error is taken', 's', 0.1, 600.0),
-    Declaration('preview_rate', 50.0, 'rate of the preview', 'Hz', 1.0, 200.0, read_only=True),
+    Declaration(
+        'preview_rate',
+        50.0,
+        'rate of the preview, and of the corrections',
+        'Hz',
+        1.0,
+        200.0,
+        read_only=True,
+    ),
+    Declaration(
+        'horizon',
+        HORIZON,
+        'by how much older than an estimate the displacement is that it uses',
+        'samples',
+        1,
+        100_000,
+    ),
 )
 
 RECORDER = (
@@ -202,6 +221,7 @@ RECORDER = (
             *SAMPLE_TOPICS,
             *LATCHED_TOPICS,
             'preview',
+            'corrections',
             'excitation/status',
             'stage/status',
             'identifier/status',

@@ -207,7 +207,7 @@ def test_preview_holds_mean_least_and_largest_of_each_20_ms(fast):
     shown, y, subscription = watch(fast, blocks(4000))
     names = [
         f'{quantity}/{what}'
-        for quantity in ('voltage', 'displacement', 'prediction', 'residual')
+        for quantity in ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
         for what in ('mean', 'min', 'max')
     ]
     # the last bin is complete when the next begins; one of before may have come late
@@ -305,7 +305,11 @@ def test_a_constant_error_is_said_and_wild_readings_are_left_out(fast):
     fast.wait(lambda: f'9 {said}' in fast.status('model')['text'], 'the wild readings')
     d = fast.diagnostics('model')
     assert said in d['message']
-    assert d['message'].startswith('the displacement is a constant +0.5 % of stroke off')
+    # a zero that moved is corrected and said, and no reason to identify again
+    fast.wait(lambda: 'corrected: offset' in fast.diagnostics('model')['message'], 'the offset')
+    d = fast.diagnostics('model')
+    assert 'identify again' not in d['message'] and 'corrected: offset +0.3' in d['message']
+    assert float(d['estimate_percent']) < 0.1
     assert float(d['residual_rms']) == pytest.approx(0.5e-2 * 75e-6, rel=1e-3)
     assert float(d['residual_mean']) == pytest.approx(0.5e-2 * 75e-6, rel=1e-3)
 
@@ -453,3 +457,61 @@ def test_a_bad_model_file_keeps_it_from_starting(lab, tmp_path):
     node = lab.start('model', {'model': str(tmp_path / 'bad.yaml')}, wait=False)
     assert node.process.wait(60) == 2
     assert 'piezo_ident: error: model:' in node.log and 'Traceback' not in node.log
+
+
+CREEP = [
+    {
+        'name': 'creep',
+        'parameters': {'gain': [0.02] * 3, 'time_constant': [0.1, 1.0, 10.0]},
+    }
+]
+
+
+def as_it_creeps(n):
+    """Return the text of a model, and voltage and displacement after a second at the top."""
+    text = paper(effects=CREEP, identification={'errors': {'held_out': 0.01}})
+    up = np.linspace(0.0, 10.0, 2000)
+    before = np.concatenate([up, np.full(20_000, 10.0), up[::-1]])
+    v = np.concatenate([before, sine(n)[1]])
+    y = model_of(text).stream().process(v, np.arange(v.size) / FS)
+    return text, y[before.size :]
+
+
+def test_the_estimate_knows_of_creep_from_before_the_stream(fast):
+    n = 12_000
+    text, truth = as_it_creeps(n)
+    since, estimate = reset(fast, text), fast.collect('estimate')
+    fast.matched('estimate')
+    corrections = []
+    subscription = fast.node.create_subscription(
+        JointState, 'corrections', corrections.append, QoSProfile(depth=1000)
+    )
+    before, several = len(estimate), blocks(n)
+    measured = truth + 1.5e-9 * np.random.default_rng(1).standard_normal(n)
+    # the sensor dies at 0.5 s
+    send_both = several[:100]
+    for k, (block, part) in enumerate(zip(several, np.split(measured, len(several)), strict=True)):
+        if k < len(send_both):
+            fast.publish('displacement', Samples(block.t, part, block.segment, 'displacement'))
+        send(fast, [block])
+    t, y = heard(fast, 'prediction', since['prediction'], len(several))
+    # the horizon is a block: the one after the last reading has its estimate, the others wait
+    told = len(send_both) + 1
+    fast.wait(lambda: len(estimate) >= before + told, 'estimates')
+    found = column(estimate[before : before + told])
+    assert np.array_equal(found[0], t[: found[0].size])
+    assert estimate[before].segment == several[0].segment
+    late = slice(2000, found[0].size)
+    off, free = (np.sqrt(np.mean((x[late] - truth[late]) ** 2)) for x in (found[1], y))
+    assert free > 0.005 * 75e-6 and off < 0.02 * free
+    # another half a second, and it goes on without
+    more = blocks(8000, n)
+    send(fast, more)
+    fast.wait(lambda: len(estimate) >= before + 200, 'estimates without a sensor')
+    _, y = column(estimate[before : before + 120])
+    late = slice(10_100, n)
+    assert np.sqrt(np.mean((y[late] - truth[late]) ** 2)) < 0.1 * free
+    fast.wait(lambda: len(corrections) >= 45, 'corrections')
+    names = ['offset/value', 'offset/std', 'creep/value', 'creep/std']
+    assert list(corrections[-1].name)[:4] == names
+    fast.forget(subscription)

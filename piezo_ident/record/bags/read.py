@@ -290,7 +290,7 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
 
 def is_computed(topic: str) -> bool:
     """Return whether a topic is computed by a model, and not measured."""
-    return topic.rpartition('/')[2] in ('prediction', 'residual')
+    return topic.rpartition('/')[2] in ('prediction', 'residual', 'estimate')
 
 
 def _choose(

@@ -1,0 +1,163 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The estimate beside a running stage: prediction and displacement joined for an observer.
+
+An estimate waits until the displacement of a horizon before has come, or is known to be missing:
+later displacement has come, or for `PATIENCE` none did.  It therefore does not matter which of the
+two streams comes first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.live.block_clock import BlockClock
+from piezo_ident.live.predictor import BRIDGE
+from piezo_ident.live.sample_clock import Kind
+from piezo_ident.model.observer import HORIZON, Observed, Observer
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.blocks import Samples
+
+#: time of the stream for which displacement is waited for [s]
+PATIENCE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """An estimate as a block, and what the observer says of its samples."""
+
+    samples: Samples
+    seen: Observed
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """A block of prediction that waits: its first tick, and the voltage."""
+
+    tick: int
+    prediction: Samples
+    v: Array
+
+
+class Corrector:
+    """
+    Corrects predictions by displacement that comes at least a horizon before.
+
+    Parameters
+    ----------
+    horizon : int, optional
+        [samples]
+    """
+
+    def __init__(self, horizon: int = HORIZON) -> None:
+        self._horizon = horizon
+        self._model: StageModel | None = None
+        self._forget()
+
+    @property
+    def observer(self) -> Observer | None:
+        """The observer of the run; None before there is one."""
+        return self._observer
+
+    @property
+    def span(self) -> float:
+        """Displacement of the model over its range [m]; infinite without a model."""
+        return abs(self._model.scaling.Y) if self._model is not None else np.inf
+
+    def set_model(self, model: StageModel) -> None:
+        """Take the model that predicts from now on."""
+        self._model = model
+        self._forget()
+
+    def set_horizon(self, horizon: int) -> None:
+        """Take another horizon, and begin anew."""
+        self._horizon = horizon
+        self._forget()
+
+    def _forget(self) -> None:
+        self._clock = BlockClock()
+        self._observer: Observer | None = None
+        self._waiting: list[_Block] = []
+        self._measured: list[tuple[Integers, Array]] = []
+        # the tick that comes next, and the newest ones that displacement has told of and that are
+        # decided
+        self._next, self._told, self._decided = 0, -1, -1
+        self._last: tuple[float, float] | None = None
+
+    def predicted(self, prediction: Samples, voltage: Samples, known: bool) -> list[Estimated]:
+        """
+        Take a prediction, of the last samples of a block of voltage; return what can be estimated.
+
+        `known` is whether a run that was under way before this model has the memory of the plays.
+        """
+        if self._model is None:
+            return []
+        done: list[Estimated] = []
+        t, v = prediction.t, voltage.values[-prediction.t.size :].astype(np.float64)
+        before = self._clock.period
+        kind, missing = self._clock.judge(t)
+        period = self._clock.period
+        if kind is Kind.LATE:
+            return []
+        jumps = kind is Kind.GAP and missing * period > BRIDGE
+        if kind is Kind.START or jumps or abs(period / before - 1.0) > 1e-3:
+            done = self._estimates(everything=True)
+            known &= kind is Kind.START and not self._clock.restarts
+            self._forget()
+            self._clock.judge(t)
+            model = self._model
+            if model.is_static:
+                model = replace(model, sample_rate=1.0 / period)
+            self._observer = Observer(model, horizon=self._horizon, known=known)
+        elif kind is Kind.GAP and self._last is not None:
+            # as the prediction went on, over a straight line
+            share = np.arange(1, missing + 1) / (missing + 1)
+            v0, y0 = self._last
+            y = y0 + (float(prediction.values[0]) - y0) * share
+            self._wait(Samples(np.full(missing, np.nan), y), v0 + (float(v[0]) - v0) * share)
+        self._wait(prediction, v)
+        self._last = float(v[-1]), float(prediction.values[-1])
+        return done + self._estimates()
+
+    def _wait(self, prediction: Samples, v: Array) -> None:
+        self._waiting.append(_Block(self._next, prediction, v))
+        self._next += v.size
+
+    def measured(self, t: Array, y: Array) -> list[Estimated]:
+        """Take displacement [m] of times that were predicted; return what can be estimated."""
+        if self._observer is None:
+            return []
+        ticks = np.rint((t - self._clock.begin) / self._clock.period).astype(np.int64)
+        self._measured.append((ticks, y))
+        self._told = max(self._told, int(ticks[-1]))
+        return self._estimates()
+
+    def _estimates(self, everything: bool = False) -> list[Estimated]:
+        """Return the estimates of the blocks whose displacement is decided."""
+        newest, decided = self._next - 1, self._told
+        if everything or (newest - self._told) * self._clock.period >= PATIENCE:
+            decided = max(decided, newest - self._horizon)
+        self._decided = max(self._decided, decided)
+        done = []
+        while self._waiting and self._observer is not None:
+            block = self._waiting[0]
+            first, end = (block.tick + n - self._horizon for n in (0, block.v.size))
+            if end - 1 > self._decided:
+                break
+            self._waiting.pop(0)
+            y = np.full(block.v.size, np.nan)
+            for ticks, values in self._measured:
+                here = (ticks >= first) & (ticks < end)
+                y[ticks[here] - first] = values[here]
+            self._measured = [part for part in self._measured if part[0][-1] >= end]
+            seen = self._observer.process(block.v, block.prediction.values, y)
+            if np.isnan(block.prediction.t[0]):
+                # nobody saw the voltage
+                self._observer.lose_memory()
+                continue
+            done.append(Estimated(replace(block.prediction, values=seen.estimate), seen))
+        return done

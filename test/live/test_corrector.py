@@ -1,0 +1,119 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Prediction and displacement joined for an observer, whichever comes first."""
+
+from dataclasses import replace
+import itertools
+
+import numpy as np
+from numpy.testing import assert_allclose
+from paper_stage import FS, PAPER
+from piezo_ident.live.corrector import Corrector
+from piezo_ident.live.monitor import Matcher
+from piezo_ident.live.predictor import Predictor
+from piezo_ident.model.observer import observe
+from piezo_ident.record.blocks import Samples
+from piezo_ident.record.record import Piece
+import pytest
+
+MODEL = replace(PAPER, identification={'errors': {'held_out': 0.01}})
+N = 12_000
+T = np.arange(N) / FS
+V = 5.0 - 4.0 * np.cos(2 * np.pi * 5 * T)
+Y = MODEL.simulate(V) + 0.4e-6 + 2e-9 * np.random.default_rng(1).standard_normal(N)
+
+
+class Line:
+    """What the node does with the two streams."""
+
+    def __init__(self):
+        self.predictor, self.matcher, self.corrector = Predictor(), Matcher(), Corrector()
+        self.predictor.set_model(MODEL)
+        self.corrector.set_model(MODEL)
+        self.got = []
+
+    def voltage(self, cut):
+        samples = Samples(T[cut], V[cut])
+        known = self.predictor.memory_known
+        prediction = self.predictor.process(samples)
+        if prediction is not None:
+            self.got += self.corrector.predicted(prediction, samples, known)
+            self._pairs(self.matcher.predicted(prediction))
+
+    def displacement(self, cut):
+        self._pairs(self.matcher.measured(Samples(T[cut], Y[cut], '', 'displacement')))
+
+    def _pairs(self, pairs):
+        for pair in pairs:
+            self.got += self.corrector.measured(pair.t, pair.y)
+
+    @property
+    def rows(self):
+        t = np.concatenate([one.samples.t for one in self.got])
+        return t, np.concatenate([one.samples.values for one in self.got])
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_neither_the_order_of_arrival_nor_cuts_matter(seed):
+    rng = np.random.default_rng(seed)
+    # blocks of at least two samples, as one tells no rate
+    ends = [[0, *np.sort(rng.choice(np.arange(2, N, 2), 60, replace=False)), N] for _ in range(2)]
+    cuts = [[slice(a, b) for a, b in itertools.pairwise(e)] for e in ends]
+    line, (voltage, displacement) = Line(), cuts
+    while voltage or displacement:
+        # one of them up to 0.3 s behind the other
+        lead = (
+            voltage[0].start / FS - displacement[0].start / FS if voltage and displacement else 0
+        )
+        first = rng.random() < 0.5 if abs(lead) < 0.3 else lead < 0
+        if voltage and (first or not displacement):
+            line.voltage(voltage.pop(0))
+        else:
+            line.displacement(displacement.pop(0))
+    t, y = line.rows
+    expected = observe(MODEL, Piece(V, Y, FS)).estimate
+    assert t.size == N
+    assert_allclose(y, expected, rtol=0, atol=1e-12 * 75e-6)
+    assert np.abs(y - Y)[2000:].max() < 2e-8 + 5e-8
+
+
+def test_without_displacement_it_waits_half_a_second_and_goes_on():
+    line = Line()
+    for k in range(0, N, 100):
+        line.voltage(slice(k, k + 100))
+    # the last wait for nothing
+    assert len(line.got) == N // 100
+    free = MODEL.simulate(V)
+    assert np.array_equal(line.rows[1], free)
+
+
+def test_a_sensor_that_falls_silent_and_comes_back_is_used_again():
+    line = Line()
+    for k in range(0, N, 100):
+        line.voltage(slice(k, k + 100))
+        if not 2000 <= k < 2000 + 0.7 * FS // 2:
+            line.displacement(slice(k, k + 100))
+    t, y = line.rows
+    reading = Y.copy()
+    reading[2000:9000] = np.nan
+    expected = observe(MODEL, Piece(V, reading, FS)).estimate
+    assert t.size == N
+    assert_allclose(y, expected, rtol=0, atol=1e-12 * 75e-6)
+
+
+@pytest.mark.parametrize('missing', [200, 11_000])
+def test_a_gap_of_voltage_and_a_restart_keep_it_going(missing):
+    line = Line()
+    for k in range(0, N, 100):
+        if not 500 <= k < 500 + min(missing, 4000):
+            line.voltage(slice(k, k + 100))
+            line.displacement(slice(k, k + 100))
+    line.voltage(slice(0, 100))
+    for k in range(0, 4000, 100):
+        line.voltage(slice(k + 100, k + 200))
+        line.displacement(slice(k, k + 100))
+    t, y = line.rows
+    assert t.size == N - min(missing, 4000) + 4100
+    assert np.isfinite(y).all()
+    assert np.abs(y[-2000:] - Y[2100:4100]).max() < 2e-7
