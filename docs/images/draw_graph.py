@@ -31,6 +31,8 @@ TOPICS = (
     ('tracking_error', ('feedforward',), ()),
     ('prediction', ('model',), ()),
     ('residual', ('model',), ()),
+    ('estimate', ('model',), ()),
+    ('corrections', ('model',), ()),
     ('preview', ('model',), ()),
     ('model', ('identifier',), ('model', 'feedforward')),
     ('report', ('identifier',), ()),
@@ -54,9 +56,11 @@ SPOTS = {
     'report': (9.0, 4.8),
     'reference': (3.6, 6.8),
     'tracking_error': (9.0, 6.8),
-    'prediction': (9.0, 3.3),
-    'residual': (9.0, 2.6),
-    'preview': (9.0, 1.9),
+    'prediction': (9.0, 3.4),
+    'residual': (9.0, 2.95),
+    'estimate': (9.0, 2.5),
+    'corrections': (9.0, 2.0),
+    'preview': (9.0, 1.55),
 }
 NODE, TOPIC = '#2b5c8a', '#555555'
 WIDTH, HEIGHT = 1.9, 0.72

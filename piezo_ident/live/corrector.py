@@ -6,7 +6,7 @@ The estimate beside a running stage: prediction and displacement joined for an o
 
 An estimate waits until the displacement of a horizon before has come, or is known to be missing:
 later displacement has come, or for `PATIENCE` none did.  It therefore does not matter which of the
-two streams comes first.
+two streams comes first.  What still waits when a stream starts over has no estimate.
 """
 
 from __future__ import annotations
@@ -96,7 +96,6 @@ class Corrector:
         """
         if self._model is None:
             return []
-        done: list[Estimated] = []
         t, v = prediction.t, voltage.values[-prediction.t.size :].astype(np.float64)
         before = self._clock.period
         kind, missing = self._clock.judge(t)
@@ -105,7 +104,6 @@ class Corrector:
             return []
         jumps = kind is Kind.GAP and missing * period > BRIDGE
         if kind is Kind.START or jumps or abs(period / before - 1.0) > 1e-3:
-            done = self._estimates(everything=True)
             known &= kind is Kind.START and not self._clock.restarts
             self._forget()
             self._clock.judge(t)
@@ -121,7 +119,7 @@ class Corrector:
             self._wait(Samples(np.full(missing, np.nan), y), v0 + (float(v[0]) - v0) * share)
         self._wait(prediction, v)
         self._last = float(v[-1]), float(prediction.values[-1])
-        return done + self._estimates()
+        return self._estimates()
 
     def _wait(self, prediction: Samples, v: Array) -> None:
         self._waiting.append(_Block(self._next, prediction, v))
@@ -136,10 +134,10 @@ class Corrector:
         self._told = max(self._told, int(ticks[-1]))
         return self._estimates()
 
-    def _estimates(self, everything: bool = False) -> list[Estimated]:
+    def _estimates(self) -> list[Estimated]:
         """Return the estimates of the blocks whose displacement is decided."""
         newest, decided = self._next - 1, self._told
-        if everything or (newest - self._told) * self._clock.period >= PATIENCE:
+        if (newest - self._told) * self._clock.period >= PATIENCE:
             decided = max(decided, newest - self._horizon)
         self._decided = max(self._decided, decided)
         done = []

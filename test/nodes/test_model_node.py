@@ -190,7 +190,7 @@ def watch(g, several, topic='preview'):
 
     reset(g)
     # nothing else tells when this reader has been met; one block alone is no run of the clock
-    g.wait(lambda: len(shown) > 2, 'previews', meanwhile=more)
+    g.wait(lambda: len(shown) > 2 and last[0].t[0] > 0.0, 'previews', meanwhile=more)
     # of these nothing may be under way when it begins
     residual = g.collect('residual')
     g.wait(lambda: residual and residual[-1].t[-1] == last[0].t[-1], 'the last residual')

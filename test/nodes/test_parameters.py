@@ -66,7 +66,7 @@ def test_executables_of_launch_files_are_installed():
 
 def test_foxglove_labels_a_path_by_what_the_preview_holds():
     layout = json.loads((ROOT / 'config/foxglove.json').read_text(encoding='utf-8'))
-    quantities = ('voltage', 'displacement', 'prediction', 'residual')
+    quantities = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
     names = [f'{quantity}/{what}' for quantity in quantities for what in ('mean', 'min', 'max')]
     paths = [p for panel in layout['configById'].values() for p in panel.get('paths', ())]
     shown = {p['label']: p['value'] for p in paths if p['value'].startswith('/preview')}
