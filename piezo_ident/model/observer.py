@@ -155,9 +155,11 @@ class Observer:
         gains = model.dynamics.gain * gains
         groups = max(1.0, PATIENCE * rate / size)
         growth = 1.0 / groups if gate < np.inf else 0.0
+        h = model.hysteresis
+        reach = BEYOND * float(np.ptp(h(np.linspace(*h.span, 65))))
         walk = WALK**2 * size / rate
         # in the order of their places
-        numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, ZEROS[-1] ** 2]
+        numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, reach**2]
         return kernel.Law(
             row=np.concatenate([[1.0], gains * before.mean(axis=1), [1.0]]),
             lead=gains * left**self.horizon,
@@ -167,13 +169,13 @@ class Observer:
         )
 
     def _start(self, u0: float) -> None:
-        law, h = self._law, self.model.hysteresis
+        law = self._law
         n, count = law.row.size, self._zeros.size
-        reach = BEYOND * float(np.ptp(h(np.linspace(*h.span, 65))))
+        reach2 = law.numbers[kernel.REACH]
         P = np.zeros((count, n, n))
         for b, zero in enumerate(self._zeros):
-            P[b] = np.diag([zero**2, *[reach**2] * (n - 2), law.numbers[kernel.ERROR]])
-        now = np.zeros(15)
+            P[b] = np.diag([zero**2, *[reach2] * (n - 2), law.numbers[kernel.ERROR]])
+        now = np.zeros(16)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
         size = max(1, round(GROUP * self.model.sample_rate))
         group, coming = np.full(size, np.nan), np.zeros(law.left.size)

@@ -15,12 +15,15 @@ from piezo_ident.common.kernel import ordered_kernel
 STUCK = 0.05
 #: log of the least weight of a hypothesis, from which it can still come back
 FAINT = -30.0
+#: variance of the offset, over the mean square of what was refused, once that is believed: nine
+#: tenths of it count as offset, the rest as error of the model (taste)
+JUMP = 9.0
 
 # places of the numbers that `State.now` holds
 COUNT, PATH, BAND, MOVED, SPREAD, SCALE, REFUSED, SCORES, READING, BEGAN = range(10)
-OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR = range(10, 15)
+OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
 # places of the numbers that `Law.numbers` holds
-NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, FREE = range(8)
+NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH = range(8)
 
 
 class Law(NamedTuple):
@@ -91,28 +94,44 @@ def _innovation(law: Law, s: State, b: int, mean: float, noise: float) -> tuple[
 
 
 @ordered_kernel
+def _rescale(law: Law, s: State, scale: float) -> None:
+    # take another size of the errors; m is at once as large as that, or the size would run away
+    scale = max(1.0, scale)
+    more = max(0.0, scale - s.now[SCALE]) * law.numbers[ERROR]
+    for b in range(s.weight.size):
+        s.P[b, -1, -1] += more
+    s.now[SCALE] = scale
+
+
+@ordered_kernel
 def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
-    # judge a measurement by the likeliest hypothesis; what lasts is believed in the end
+    # judge a measurement by the hypothesis that it suits best; what lasts is believed in the end
     numbers, now = law.numbers, s.now
-    best = int(np.argmax(s.weight))
     noise = now[SCALE] * numbers[NOISE] / count
-    off, power = _innovation(law, s, best, mean, noise)
-    score = off * off / power
+    score, power = np.inf, 0.0
+    for b in range(s.weight.size):
+        off, size = _innovation(law, s, b, mean, noise)
+        if off * off < score * size:
+            score, power = off * off / size, size
     if score <= numbers[GATE]:
         now[REFUSED] = max(0.0, now[REFUSED] - 1.0)
         if now[REFUSED] == 0.0:
             now[SCORES] = 0.0
         # a model that errs by more than it says is believed less
-        now[SCALE] = max(1.0, now[SCALE] * (1.0 + numbers[GROWTH] * (score - 1.0)))
+        _rescale(law, s, now[SCALE] * (1.0 + numbers[GROWTH] * (score - 1.0)))
         return True
     now[REFUSED] += 1.0
     now[SCORES] += score
     if now[REFUSED] < numbers[LAST]:
         return False
-    now[SCALE] *= now[SCORES] / now[REFUSED]
+    score = now[SCORES] / now[REFUSED]
+    _rescale(law, s, now[SCALE] * score)
     now[REFUSED] = now[SCORES] = 0.0
     for b in range(s.weight.size):
-        s.P[b, 0, 0] += numbers[FREE]
+        s.P[b, 0, 0] += JUMP * score * power
+        # what was found of creep may stand on an error of the model
+        for i in range(1, s.x.shape[1] - 1):
+            s.P[b, i, i] += numbers[REACH]
     return True
 
 
@@ -132,6 +151,9 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
             for j in range(n):
                 s.P[b, i, j] -= shared[i] * shared[j] / power
         s.weight[b] -= 0.5 * (np.log(power) + min(off * off / power, numbers[GATE]))
+    # mean square of m of late
+    m = s.x[int(np.argmax(s.weight)), -1]
+    now[MISFIT] += numbers[GROWTH] * (m * m - now[MISFIT])
     s.weight[:] = np.maximum(s.weight - s.weight.max(), FAINT)
 
 
@@ -158,7 +180,8 @@ def tell(law: Law, s: State) -> None:
         whole += share[b] * (s.P[b, 0, 0] + 2.0 * cross + var + (a + z) ** 2)
     now[OFFSET], now[OFFSET_VAR] = offset, max(squares - offset * offset, 0.0)
     now[CREEP], now[CREEP_VAR] = creep, max(creeps - creep * creep, 0.0)
-    now[VAR] = max(whole - (offset + creep) ** 2, 0.0) + now[SCALE] * law.numbers[ERROR]
+    now[VAR] = max(whole - (offset + creep) ** 2, 0.0)
+    now[VAR] += max(now[SCALE] * law.numbers[ERROR], now[MISFIT])
 
 
 @ordered_kernel

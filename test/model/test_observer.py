@@ -297,3 +297,16 @@ def test_it_takes_at_most_two_microseconds_a_sample():
         assert not observer.known
     print(f'{1e6 * best:.2f} us a sample')
     assert best < 4e-6  # twice what it is to take, on a machine that is busy
+
+
+@pytest.mark.parametrize('claimed', [1e-4, 1e-3])
+def test_a_gain_that_changed_shows_and_makes_nothing_worse(claimed):
+    model, n = creeping(), 20_000
+    v = moved(n)
+    truth = 1.03 * model.simulate(v)
+    seen = observe(model, Piece(v, with_noise(truth, 1.5e-9), SLOW_RATE), error=claimed * SPAN)
+    late = slice(7000, None)
+    left, free = (rms((y - truth)[late]) for y in (seen.estimate, model.simulate(v)))
+    # offset and creep cannot follow the motion: what they leave tells to identify again
+    assert 5.0 * claimed * SPAN < left < free
+    assert np.mean(np.abs(seen.estimate - truth)[late] < 2.0 * seen.std[late]) > 0.8

@@ -338,7 +338,7 @@ def test_a_sparse_channel_costs_no_other_sample(tmp_path, step, stop, n):
     assert str(fault.where) == f'x_temp, {n} samples beside 1000'
 
 
-@pytest.mark.parametrize('name', ['prediction', 'residual'])
+@pytest.mark.parametrize('name', ['prediction', 'residual', 'estimate'])
 def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
     messages = [m for v, y in blocks() for m in (('/s/voltage', v), (f'/s/{name}', y))]
     path = write(tmp_path / 'bag', messages)
