@@ -477,13 +477,18 @@ def as_it_creeps(n):
     return text, y[before.size :]
 
 
-def test_the_estimate_knows_of_creep_from_before_the_stream(fast):
+def test_the_estimate_knows_of_creep_from_before_the_stream(lab):
     n = 12_000
     text, truth = as_it_creeps(n)
-    since, estimate = reset(fast, text), fast.collect('estimate')
-    fast.matched('estimate')
+    lab.start('model')
+    estimate = lab.collect('estimate')
+    for topic in ('prediction', 'estimate'):
+        lab.collect(topic)
+        lab.matched(topic)
+    lab.publish_text('model', text)
+    lab.wait(lambda: lab.status('model').get('models') == '1', 'the model')
     corrections = []
-    subscription = fast.node.create_subscription(
+    subscription = lab.node.create_subscription(
         JointState, 'corrections', corrections.append, QoSProfile(depth=1000)
     )
     before, several = len(estimate), blocks(n)
@@ -492,12 +497,12 @@ def test_the_estimate_knows_of_creep_from_before_the_stream(fast):
     send_both = several[:100]
     for k, (block, part) in enumerate(zip(several, np.split(measured, len(several)), strict=True)):
         if k < len(send_both):
-            fast.publish('displacement', Samples(block.t, part, block.segment, 'displacement'))
-        send(fast, [block])
-    t, y = heard(fast, 'prediction', since['prediction'], len(several))
+            lab.publish('displacement', Samples(block.t, part, block.segment, 'displacement'))
+        send(lab, [block])
+    t, y = heard(lab, 'prediction', 0, len(several))
     # the horizon is a block: the one after the last reading has its estimate, the others wait
     told = len(send_both) + 1
-    fast.wait(lambda: len(estimate) >= before + told, 'estimates')
+    lab.wait(lambda: len(estimate) >= before + told, 'estimates')
     found = column(estimate[before : before + told])
     assert np.array_equal(found[0], t[: found[0].size])
     assert estimate[before].segment == several[0].segment
@@ -506,12 +511,12 @@ def test_the_estimate_knows_of_creep_from_before_the_stream(fast):
     assert free > 0.005 * 75e-6 and off < 0.02 * free
     # another half a second, and it goes on without
     more = blocks(8000, n)
-    send(fast, more)
-    fast.wait(lambda: len(estimate) >= before + 200, 'estimates without a sensor')
+    send(lab, more)
+    lab.wait(lambda: len(estimate) >= before + 200, 'estimates without a sensor')
     _, y = column(estimate[before : before + 120])
     late = slice(10_100, n)
     assert np.sqrt(np.mean((y[late] - truth[late]) ** 2)) < 0.1 * free
-    fast.wait(lambda: len(corrections) >= 45, 'corrections')
+    lab.wait(lambda: len(corrections) >= 45, 'corrections')
     names = ['offset/value', 'offset/std', 'creep/value', 'creep/std']
     assert list(corrections[-1].name)[:4] == names
-    fast.forget(subscription)
+    lab.forget(subscription)
