@@ -73,7 +73,9 @@ def fit_free_run(
     progress('delay', 1.0)
     best, found = search.best()
     progress('dynamics', 0.7)
-    found += tuple(search.wider(best, _taus(stretches)))
+    if settings.solver != 'swarm':
+        # the swarm looks for the weights of a sum of plays
+        found += tuple(search.wider(best, _taus(stretches)))
     best = search.at_rest(found)
     found += (best,)
     progress('dynamics', 1.0)

@@ -188,3 +188,14 @@ def test_slow_motion_of_many_sizes_tells_a_long_delay():
     assert (result.delay.samples, result.delay.source) == (3, 'free run')
     assert result.model.delay.total == 3
     assert list(dict(result.not_identified)) == ['dynamics']
+
+
+def test_the_swarm_fits_a_sum_of_plays_where_a_wider_law_errs_less():
+    (piece,) = record_of(np.concatenate([sine(1.0), 0.5 * sine(1.0)])).pieces
+    bent = replace(piece, y=piece.y - 0.2 * piece.y**2 / np.ptp(piece.y))
+    few = {'thresholds': 10, 'order': (2, 2), 'delay': 2}
+    laws = [
+        identify(Record((bent,), 'bent'), Settings(**few, solver=solver, swarm_iterations=200))
+        for solver in ('least_squares', 'swarm')
+    ]
+    assert [result.hysteresis.law != 'plays' for result in laws] == [True, False]
