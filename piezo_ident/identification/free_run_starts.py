@@ -236,11 +236,14 @@ class Search:
         found = [self._more(best, 'creep', self._crept(stage, taus))]
         laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
         wider = [self._more(best, law.name, stage.with_law(law)) for law in laws]
+        # of lags along the path H may fall, as no stage does
+        wider = [c for c in wider if c.fit.stage.hysteresis.lowest_slope() > 0.0]
         if shown_effect(found, best) is not None:
             law = min([best, *wider], key=lambda c: c.price).fit.stage.law
             if law.name in WIDER:
                 crept = self._crept(stage.with_law(law), taus)
-                found.append(self._more(best, f'{law.name}, creep', crept))
+                both = self._more(best, f'{law.name}, creep', crept)
+                found += [both] if both.fit.stage.hysteresis.lowest_slope() > 0.0 else []
         return [*found, *wider, *self._crept_before(found)]
 
     def _more(self, best: Candidate, name: str, stage: Stage) -> Candidate:
