@@ -94,7 +94,7 @@ class FitStep:
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Return the bounded step; damping is a share of each column's own energy."""
-        return bounded_step(self._A, self._b, self._prior, lower, upper, damping)
+        return bounded_step(self._A, self._b, lower, upper, prior=self._prior, damping=damping)
 
     def gain(self, delta: Array) -> float:
         """Return by how much a step lowers the sum of squares, were the model linear."""

@@ -48,20 +48,26 @@ class Equations:
         The prior, shape (p, p), is what is known of the step before; bounds are those of the step.
         """
         A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
-        errors, none = self.s.copy(), np.zeros(b.size)
+        errors = self.s.copy()
         for one in np.unique(sets[sets >= 0]):
             out = sets == one
             if out.all():
                 continue
             A_out, b_out = self.A[out], self.b[out]
-            theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), none, lower, upper)
+            theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), lower, upper)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
         # far from its minimum a fit promises by its derivatives what it does not keep
         return np.asarray(np.maximum(errors, self.s))
 
 
 def bounded_step(
-    A: Array, b: Array, prior: Array, lower: Array, upper: Array, damping: float = 0.0
+    A: Array,
+    b: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    prior: Array | float = 0.0,
+    damping: float = 0.0,
 ) -> Array:
     """
     Return the step that minimises ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; shape (p,).
@@ -71,8 +77,7 @@ def bounded_step(
 
     Examples
     --------
-    >>> inside = bounded_step(np.eye(2), np.array([1.0, -1.0]), np.zeros(2),
-    ...                       np.zeros(2), np.full(2, np.inf))
+    >>> inside = bounded_step(np.eye(2), np.array([1.0, -1.0]), np.zeros(2), np.full(2, np.inf))
     >>> np.round(inside, 6) + 0.0
     array([1., 0.])
     """

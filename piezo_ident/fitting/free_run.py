@@ -156,9 +156,9 @@ def _step(
     middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
     A = equations.A.sum(axis=0) + weight
     b = equations.b.sum(axis=0) + weight @ (middle - values)
-    height, none = _height(values - middle, weight), np.zeros(values.size)
+    height = _height(values - middle, weight)
     while damping < MOST:
-        step = bounded_step(A, b, none, lower - values, upper - values, damping)
+        step = bounded_step(A, b, lower - values, upper - values, damping=damping)
         if float(step @ (2.0 * b - A @ step)) < SLOW * here.loss:
             break
         try:
