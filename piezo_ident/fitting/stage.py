@@ -139,10 +139,15 @@ class Stage:
 
     def on_other(self, stretches: Sequence[Stretch]) -> Stage:
         """Return the stage for other stretches of the same records."""
-        known = np.logical_not(self.guesses.any(axis=1))
-        resting = [self.rested and bool(known[s.record]) and not s.before.size for s in stretches]
+        known = self._known & self.rested
+        resting = [bool(known[s.record]) and not s.before.size for s in stretches]
         lags = np.zeros((len(stretches), self.taus.size))
         return replace(self, lags=lags, resting=np.array(resting))
+
+    @property
+    def _known(self) -> Mask:
+        """Records whose memory at the start is known, shape (records,)."""
+        return np.logical_not(self.guesses.any(axis=1))
 
     @property
     def hysteresis(self) -> Hysteresis:
@@ -217,10 +222,7 @@ class Stage:
         lower[creep], upper[creep] = 0.0, MOST_CREEP
         lower[lags], upper[lags] = -1.0, 1.0
         lower[starts], upper[starts] = 0.0, 1.0
-        for part, known in (
-            (lags, self.resting),
-            (starts, np.logical_not(self.guesses.any(axis=1))),
-        ):
+        for part, known in ((lags, self.resting), (starts, self._known)):
             held = np.repeat(known, (part.stop - part.start) // max(known.size, 1))
             lower[part] = np.where(held, 0.0, lower[part])
             upper[part] = np.where(held, 0.0, upper[part])
@@ -339,11 +341,10 @@ class Stage:
             for share, tau, _ in self._unrest(stretch):
                 seen = number == stretch.number and share > 0.0 and not self.resting[number]
                 yield share * np.exp(-stretch.times / tau) if seen else None
-        H = self.hysteresis
+        H, known = self.hysteresis, self._known
         for record, shares in enumerate(self.starts):
-            known = not self.guesses[record].any()
             for j, share in enumerate(shares):
-                if record != stretch.record or known:
+                if record != stretch.record or known[record]:
                     yield None
                     continue
                 step = STEP if share < 0.5 else -STEP
