@@ -139,17 +139,17 @@ class Observer:
         size = max(held if error is None else error / span, LEAST)
         noisy = size if noise is None else max(noise / span, LEAST)
         self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
+        self._group = max(1, round(GROUP * model.sample_rate))
         self._law = self._laws(size, noisy, gate)
         low, high = model.scaling.u(model.scaling.range).tolist()
-        self._width = high - low
+        self._low, self._width = low, high - low
         self._input = model.input_chain()
         self._bounds = MemoryBounds(model.hysteresis, low, (low, high))
         self._is_known, self._started, self._is_lost = known, False, False
 
     def _laws(self, error: float, noise: float, gate: float) -> kernel.Law:
-        model, rate = self.model, self.model.sample_rate
+        model, rate, size = self.model, self.model.sample_rate, self._group
         gains, times = creep_elements(model)
-        size = max(1, round(GROUP * rate))
         left = np.exp(-1.0 / (rate * times))
         before = left[:, None] ** -np.arange(size)
         gains = model.dynamics.gain * gains
@@ -177,13 +177,11 @@ class Observer:
             P[b] = np.diag([zero**2, *[reach2] * (n - 2), law.numbers[kernel.ERROR]])
         now = np.zeros(16)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
-        size = max(1, round(GROUP * self.model.sample_rate))
-        group, coming = np.full(size, np.nan), np.zeros(law.left.size)
+        group, coming = np.full(self._group, np.nan), np.zeros(law.left.size)
         self._state = kernel.State(np.zeros((count, n)), P, np.zeros(count), group, coming, now)
         kernel.tell(law, self._state)
         self._input.reset(u0, u0)
-        low = float(self.model.scaling.u(self.model.scaling.range[0]))
-        if self._is_known or u0 - low < REST * self._width:
+        if self._is_known or u0 - self._low < REST * self._width:
             self._bounds.came_down(u0)
         else:
             self._bounds.forget(u0)
