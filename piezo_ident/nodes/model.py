@@ -57,7 +57,7 @@ class ModelNode(LabNode):
         self._error = LiveError(self.values['window'])
         self._corrector, self._estimates = Corrector(self.values['horizon']), Matcher()
         # of the estimate, and what was corrected last
-        self._left, self._corrected = LiveError(self.values['window']), ''
+        self._left = LiveError(self.values['window'])
         self._seen: dict[str, float] = {}
         self._bin = -1
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
@@ -193,7 +193,7 @@ class ModelNode(LabNode):
         return self._predictor.memory_lost and not self._is_known
 
     def _correct(self, several: list[Estimated]) -> None:
-        stroke = abs(self._corrector.span)
+        stroke = self._corrector.span
         for one in several:
             samples, seen = one.samples, one.seen
             self._estimate.publish(to_message(samples))
@@ -233,26 +233,25 @@ class ModelNode(LabNode):
         self._problems[problem] = time.monotonic()
         self._report_state()
 
-    def _verdict(self) -> str:
-        """Return why the stage should be identified again, empty when there is no reason."""
+    def _verdict(self) -> tuple[str, str]:
+        """Return why to identify the stage again, or else what is corrected; both may be empty."""
         model, ratio = self._predictor.model, self.values['warn_ratio']
-        self._corrected = ''
         if model is None or self._left.seconds < 0.5 * self._left.window:
-            return ''
+            return '', ''
         before, span = expected_error(model), abs(model.scaling.Y)
         left = percent(np.fmin(self._left.rms, self._error.rms), span)
         if before is None:
-            return ''
+            return '', ''
         if left > ratio * before:
             said = f'{left:.3g} % of stroke, {left / before:.1f} times that at identification'
-            return f'identify again, or diagnose on this motion: the live error is {said}'
+            return f'identify again, or diagnose on this motion: the live error is {said}', ''
         if self._error.seconds and self._live_error(model) > ratio * before:
             offset, creep = (self._seen.get(f'{x}/value', 0.0) for x in ('offset', 'creep'))
             parts = [f'offset {1e6 * offset:+.2g} um']
             if abs(creep) > 1e-4 * span:
                 parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
-            self._corrected = f'corrected: {", ".join(parts)}'
-        return ''
+            return '', f'corrected: {", ".join(parts)}'
+        return '', ''
 
     def _left_out(self) -> str:
         n = self._error.outliers
@@ -326,7 +325,8 @@ class ModelNode(LabNode):
         values['estimate_rms'] = f'{self._left.rms:.6g}'
         values['estimate_percent'] = f'{percent(self._left.rms, self._corrector.span):.4g}'
         values |= {name: f'{x:.6g}' for name, x in self._seen.items()}
-        problems = [mismatch or self._verdict(), self._left_out()]
+        verdict, corrected = (mismatch, '') if mismatch else self._verdict()
+        problems = [verdict, self._left_out()]
         if again:
             about = 'samples of displacement came again or out of turn: do two nodes publish it?'
             problems.append(f'{again} {about}')
@@ -338,7 +338,7 @@ class ModelNode(LabNode):
             if room < -1e-3 * (model.scaling.range[1] - model.scaling.range[0]):
                 problems.append(f'the voltage leaves the identified range by {-room:.3g} V')
         message = '; '.join(filter(None, problems))
-        told = '; '.join(filter(None, [message or 'predicting', self._corrected]))
+        told = '; '.join(filter(None, [message or 'predicting', corrected]))
         return WARN if message else OK, told, values
 
     def close(self) -> None:
