@@ -253,9 +253,11 @@ def _records(records: list[tuple[Array, Array]]) -> list[pi.Record]:
     ]
 
 
-def program(records: list[tuple[Array, Array]]) -> pi.StageModel:
-    """Identify a model as a user does: no labels, no settings."""
-    return pi.identify(_records(records)).model
+def program(
+    records: list[tuple[Array, Array]], settings: pi.Settings | None = None
+) -> pi.StageModel:
+    """Identify a model as a user does: no labels, and of the study no settings."""
+    return pi.identify(_records(records), settings).model
 
 
 def slow_motion(model: pi.StageModel, rng: np.random.Generator) -> Array:

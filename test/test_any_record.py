@@ -8,7 +8,9 @@ import warnings
 import any_record as study
 import bouc_wen
 import numpy as np
+from piezo_ident.identification.results import Settings
 import pytest
+from scipy.signal import butter, sosfiltfilt
 
 SECONDS = 1.5
 
@@ -30,9 +32,36 @@ def test_no_peer_errs_clearly_less(identified):
         assert own <= 1.05 * min(peers), case.kind
 
 
-def test_H_rises_and_the_inverse_asks_for_no_jump(identified):
-    for case, model in identified:
-        assert study.drive_fault(model, np.random.default_rng(0)) == '', case.kind
+@pytest.fixture(scope='module')
+def quick():
+    """Return models of further kinds of record, of half a second and a low order."""
+    kinds = (
+        ('turning-curves', 'sine'),
+        ('preisach', 'growing sine'),
+        ('bouc-wen', 'random binary'),
+    )
+    drawn = [study.draw(law, kind, 3, 0.5) for law, kind in kinds]
+    return [(case, study.program(case.fit, Settings(max_order=4))) for case in drawn]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_H_rises_and_the_inverse_asks_for_no_jump(identified, quick, seed):
+    for case, model in identified + quick:
+        assert study.drive_fault(model, np.random.default_rng(seed)) == '', case.kind
+
+
+def test_a_slow_motion_holds_nothing_fast_with_its_ends():
+    model = study.pi.SimulatedStage.load('paper').model
+    wanted = study.slow_motion(model, np.random.default_rng(0))
+    rests = np.pad(wanted, wanted.size, mode='edge')
+    step = 1e-3 * np.ptp(wanted)
+    mode = min(m.frequency for m in model.dynamics.modes(model.sample_rate))
+    sos = butter(4, mode, 'highpass', fs=model.sample_rate, output='sos')
+    assert np.abs(sosfiltfilt(sos, rests - rests[0])).max() < step
+    # with a corner at its beginning the drive has to jump
+    late = wanted[np.argmax(np.diff(wanted)) :]
+    drives = [np.abs(np.diff(model.inverse(y).v)).max() for y in (wanted, late)]
+    assert drives[1] > 2.0 * drives[0]
 
 
 def test_the_bouc_wen_spring_is_that_of_the_benchmark():

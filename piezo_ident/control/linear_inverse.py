@@ -102,7 +102,7 @@ def linear_inverse(model: StageModel) -> LinearInverse:
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
-        raise ModelError('a model without a static gain has no inverse')
+        raise ModelError('this model has no inverse: its G is without a static gain')
     n = SHORTEST
     # a longer delay would come round
     while n < OF_DELAY * model.total_delay.samples:
@@ -125,9 +125,13 @@ def linear_inverse(model: StageModel) -> LinearInverse:
             # the static gain of the whole model without effects; what they change is small
             return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - start, stop - 1 - n // 2)
         n *= 2
+    a, b = model.dynamics.a, model.dynamics.b
+    radii = np.abs(np.concatenate([np.roots(np.append(1.0, a)), np.roots(b)]))
+    slowest = min(radii, key=lambda r: abs(r - 1.0), default=0.0)
     raise ModelError(
-        f'the inverse of G and its delay takes more than {LONGEST} samples; identify again with a '
-        'lower order'
+        f'this model has no inverse of less than {LONGEST} samples: its delay is '
+        f'{model.total_delay.total:g} samples, and the pole or zero of G that dies away last has '
+        f'the radius {slowest:.6f}; identify again with a lower order'
     )
 
 

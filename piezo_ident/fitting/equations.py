@@ -20,11 +20,14 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import IdentificationError
-from scipy.optimize import lsq_linear
+from scipy.optimize import lsq_linear, nnls
 
 #: share of the energy of a column that is added to the diagonal, so that rounding cannot make it
 #: negative: single precision of the products of double precision numbers
 RIDGE = 1e-10
+#: by how much a row may be undercut, a rounding error of slopes about one, and rows that may be
+#: held in one step
+UNDERCUT, CUTS = 1e-7, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +43,20 @@ class Equations:
     s: Array
     rows: Integers
 
-    def held_out(self, sets: Integers, prior: Array, lower: Array, upper: Array) -> Array:
+    def held_out(
+        self,
+        sets: Integers,
+        prior: Array,
+        lower: Array,
+        upper: Array,
+        rising: tuple[Array, Array] | None = None,
+    ) -> Array:
         """
         Return the sum of squares of every block, predicted from the other sets; shape (n_b,).
 
         Blocks of one number in `sets`, shape (n_b,), are left out together, those of -1 never.
-        The prior, shape (p, p), is what is known of the step before; bounds are those of the step.
+        The prior, shape (p, p), is what is known of the step before; bounds and `rising` are those
+        of `bounded_step`.
         """
         A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
         errors = self.s.copy()
@@ -54,7 +65,8 @@ class Equations:
             if out.all():
                 continue
             A_out, b_out = self.A[out], self.b[out]
-            theta = bounded_step(A - A_out.sum(axis=0), b - b_out.sum(axis=0), lower, upper)
+            A_in, b_in = A - A_out.sum(axis=0), b - b_out.sum(axis=0)
+            theta = bounded_step(A_in, b_in, lower, upper, rising=rising)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
         # far from its minimum a fit promises by its derivatives what it does not keep
         return np.asarray(np.maximum(errors, self.s))
@@ -68,12 +80,14 @@ def bounded_step(
     *,
     prior: Array | float = 0.0,
     damping: float = 0.0,
+    rising: tuple[Array, Array] | None = None,
 ) -> Array:
     """
     Return the step that minimises ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; shape (p,).
 
-    `damping` is a share of the energy of each column.  Equations that are no numbers raise
-    IdentificationError.
+    `damping` is a share of the energy of each column.  With `rising`, rows of shape (k, p) and
+    the least of each, shape (k,), ``rows x`` is no less either, where there is such an x.
+    Equations that are no numbers raise IdentificationError.
 
     Examples
     --------
@@ -91,16 +105,60 @@ def bounded_step(
     x = np.zeros(size.size)
     try:
         L = np.linalg.cholesky(scaled)
-        target = np.linalg.solve(L, b / size)
+        target = np.asarray(np.linalg.solve(L, b / size), dtype=np.float64)
         bounds = ((lower * size)[wide], (upper * size)[wide])
         with np.errstate(divide='ignore', invalid='ignore'):
             x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
         if not np.isfinite(x).all():
             # an active set that is a rounding error away from its bound divides by zero
             x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='trf').x
+        if rising is not None:
+            rows = (rising[0] / size)[:, wide]
+            x[wide] = _no_less(x[wide], L.T[:, wide], target, bounds, (rows, rising[1]))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise IdentificationError(
             f'the free-run fit is singular ({error}): its parameters do not follow from these '
             'data; record a longer motion over the whole range'
         ) from None
     return np.asarray(np.clip(x / size, lower, upper))
+
+
+def _no_less(
+    x: Array,
+    M: Array,
+    target: Array,
+    bounds: tuple[Array, Array],
+    rising: tuple[Array, Array],
+) -> Array:
+    """
+    Return the x inside bounds that minimises ``|M x - target|`` where ``rows x`` is no less.
+
+    The row that is undercut most joins the inequalities in turn.  They are met by the problem of
+    the least distance: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974,
+    chapter 23, doi:10.1137/1.9781611971217.
+    """
+    (lower, upper), (rows, least) = bounds, rising
+    Q, R = np.linalg.qr(M)
+    middle, one = np.linalg.solve(R, Q.T @ target), np.eye(x.size)
+    below, above = np.isfinite(lower), np.isfinite(upper)
+    E = np.vstack([one[below], -one[above]])
+    f = np.concatenate([lower[below], -upper[above]])
+    for _ in range(CUTS):
+        short = least - rows @ x
+        k = int(np.argmax(short))
+        if short[k] <= UNDERCUT:
+            break
+        E, f = np.vstack([E, rows[k]]), np.append(f, least[k])
+        G, h = np.linalg.solve(R.T, E.T), f - E @ middle
+        # the farthest half-space gives the unit of the distance
+        unit = float(np.max(h / np.linalg.norm(G, axis=0)))
+        system, last = np.vstack([G, h / unit]), np.eye(x.size + 1)[-1]
+        try:
+            left = last - system @ nnls(system, last)[0]
+        except RuntimeError:
+            break
+        if not left[-1] > RIDGE:
+            # no x meets them all
+            break
+        x = middle - unit * np.linalg.solve(R, left[:-1] / left[-1])
+    return x

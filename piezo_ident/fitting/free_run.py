@@ -67,9 +67,9 @@ class Fit:
 
     def held_out(self, sets: Integers) -> Array:
         """Return the sum of squares of each block, predicted from the other sets; shape (n_b,)."""
-        values = self.stage.values
-        lower, upper = self.stage.bounds
-        return self.equations.held_out(sets, self.prior_weight(), lower - values, upper - values)
+        values, (lower, upper) = self.stage.values, self.stage.bounds
+        bounds = lower - values, upper - values
+        return self.equations.held_out(sets, self.prior_weight(), *bounds, self.stage.rising)
 
     def covariance(self) -> Array:
         """Return the covariance of the values, for white residuals; zero on a bound."""
@@ -156,9 +156,10 @@ def _step(
     middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
     A = equations.A.sum(axis=0) + weight
     b = equations.b.sum(axis=0) + weight @ (middle - values)
-    height = _height(values - middle, weight)
+    height, rising = _height(values - middle, weight), here.stage.rising
+    bounds = lower - values, upper - values
     while damping < MOST:
-        step = bounded_step(A, b, lower - values, upper - values, damping=damping)
+        step = bounded_step(A, b, *bounds, damping=damping, rising=rising)
         if float(step @ (2.0 * b - A @ step)) < SLOW * here.loss:
             break
         try:

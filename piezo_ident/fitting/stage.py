@@ -23,6 +23,10 @@ signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999),
 H rises with the voltage.  Right behind a turning point only its powers of v move; their slope is
 a quadratic in v, and its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and t^2 with t
 from 0 to 1 over the span of the law, are the numbers of the fit, at least `LEAST_SLOPE` each.
+With lags along the path the slope depends on all that came before.  It is linear in c all the
+same, and at least as large on sweeps between any two of a few voltages.  What lies below already,
+as a gain of G lowers it on its way into H, may stay: a step that had to mend it first would lead
+up, and the fit would end where it began.
 """
 
 from __future__ import annotations
@@ -218,7 +222,8 @@ class Stage:
         p, n = starts.stop, len(self._powers)
         lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
         lower[h] = self.law.lower
-        lower[h.stop - n : h.stop] = LEAST_SLOPE
+        slopes = slice(h.stop - n, h.stop)
+        lower[slopes] = np.minimum(LEAST_SLOPE, self.values[slopes])
         lower[creep], upper[creep] = 0.0, MOST_CREEP
         lower[lags], upper[lags] = -1.0, 1.0
         lower[starts], upper[starts] = 0.0, 1.0
@@ -227,6 +232,22 @@ class Stage:
             lower[part] = np.where(held, 0.0, lower[part])
             upper[part] = np.where(held, 0.0, upper[part])
         return lower, upper
+
+    @property
+    def rising(self) -> tuple[Array, Array] | None:
+        """
+        Rows, shape (k, p), and the least of each times a step, shape (k,), so that H rises.
+
+        None without lags along the path, where bounds say so.
+        """
+        if not self.law.lags:
+            return None
+        values, h, T = self.values, self._parts()[0], self._powers
+        rows = np.zeros((self.law.slopes.shape[0], values.size))
+        rows[:, h] = self.law.slopes
+        rows[:, h.stop - len(T) : h.stop] @= T
+        slopes = rows @ values
+        return rows, np.minimum(LEAST_SLOPE, slopes) - slopes
 
     @property
     def prior(self) -> tuple[Array, Array]:
@@ -250,7 +271,7 @@ class Stage:
         """
         Return the stage with other values.
 
-        ModelError where G is unstable, or its gain is none.
+        ModelError where G is unstable, or its gain is none, or where H falls.
         """
         h, creep, poles, offsets, lags, starts = self._parts()
         lower, upper = self.bounds
@@ -263,6 +284,8 @@ class Stage:
                 raise ModelError('dynamics: unstable, or without a gain above zero')
             # H holds the gain
             c, G = c * G.gain, G.normalised()
+        if not self.law.hysteresis(c).lowest_slope() > 0.0:
+            raise ModelError('hysteresis: H falls under a rising voltage')
         return replace(
             self,
             coefficients=c,

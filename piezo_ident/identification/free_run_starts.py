@@ -236,13 +236,11 @@ class Search:
         found = [self._more(best, 'creep', self._crept(stage, taus))]
         laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
         wider = [self._more(best, law.name, stage.with_law(law)) for law in laws]
-        wider = [c for c in wider if _rises(c)]
         if shown_effect(found, best) is not None:
             law = min([best, *wider], key=lambda c: c.price).fit.stage.law
             if law.name in WIDER:
                 crept = self._crept(stage.with_law(law), taus)
-                both = self._more(best, f'{law.name}, creep', crept)
-                found += [both] if _rises(both) else []
+                found.append(self._more(best, f'{law.name}, creep', crept))
         return [*found, *wider, *self._crept_before(found)]
 
     def _more(self, best: Candidate, name: str, stage: Stage) -> Candidate:
@@ -342,8 +340,3 @@ def _with_dynamics(stage: Stage, d: int, G: Dynamics) -> Stage:
     """Return a stage with another G, whose gain goes into H."""
     gain = G.gain
     return replace(stage, dynamics=G.normalised(), delay=d, coefficients=stage.coefficients * gain)
-
-
-def _rises(one: Candidate) -> bool:
-    """Return whether H rises, as that of a stage does: with lags along the path it may fall."""
-    return one.fit.stage.hysteresis.lowest_slope() > 0.0

@@ -208,23 +208,28 @@ class Hysteresis:
 
     @functools.cached_property
     def flattest(self) -> tuple[float, float]:
+        """A lower bound of dw/dv over the span, and the voltage where it is."""
+        places, slope = self.slopes(sweeps=self.relaxations is not None)
+        k = int(np.argmin(slope))
+        return float(slope[k]), float(places[k])
+
+    def slopes(self, sweeps: bool) -> tuple[Array, Array]:
         """
-        A lower bound of dw/dv over the span, and the voltage where it is.
+        Return voltages over the span, and the slope behind a turn at each; shapes (k,).
 
         With lags along the path, sweeps between any two of nine voltages count, too.
         """
         low, high = self.span
         places = np.linspace(low, high, 129)
         slope = self.slope_at_turns(places)
-        if self.relaxations is not None:
+        if sweeps:
             levels = np.linspace(low, high, 9)
             ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
             legs = [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise(ends) if a != b]
             v = np.concatenate(legs)
             places = np.append(places, v[1:])
             slope = np.append(slope, np.diff(self(v)) / np.diff(v))
-        k = int(np.argmin(slope))
-        return float(slope[k]), float(places[k])
+        return places, slope
 
     def slope_at_turns(self, v: Array) -> Array:
         """

@@ -228,6 +228,15 @@ class HysteresisLaw:
             found.append((part, moved))
         return tuple(found)
 
+    @functools.cached_property
+    def slopes(self) -> Array:
+        """
+        What each coefficient adds to the slopes of H, sweeps included; shape (k, size).
+
+        H rises where they are positive, times coefficients.  Those of `bias` are not linear.
+        """
+        return np.column_stack([part.slopes(sweeps=True)[1] for part, _ in self._parts])
+
     def columns(
         self, v: Array, memory: ArrayLike | None = None, places: Sequence[int] | None = None
     ) -> Iterator[Array]:

@@ -66,12 +66,16 @@ def test_what_cannot_be_costs_one_line(wanted, options, line):
     assert '\n' not in str(error.value)
 
 
-def test_an_h_that_falls_and_a_g_that_gains_nothing_have_no_inverse():
+def test_what_has_no_inverse_is_named():
     h = Hysteresis(PAPER.hysteresis.thresholds, PAPER.hysteresis.weights, -0.8, 1.1)
     with pytest.raises(ModelError, match=r'no inverse: its slope falls to -1\.3'):
         pi.invert(replace(PAPER, hysteresis=h), SINE)
     with pytest.raises(ModelError, match='without a static gain'):
         pi.invert(replace(PAPER, dynamics=Dynamics([0.5], [1.0, -1.0])), SINE)
+    # a pole and a zero of ten seconds, as of a drift
+    slow = Dynamics(np.polymul(np.r_[1.0, PAPER.dynamics.a], [1.0, -0.99999])[1:], [1.0, -0.99998])
+    with pytest.raises(ModelError, match=r'this model .* 0\.99999'):
+        pi.invert(replace(PAPER, dynamics=slow.normalised()), SINE)
 
 
 @pytest.mark.parametrize('level', [0.0, 30e-6, float(PAPER.simulate(np.full(3000, 10.0))[-1])])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError
 from piezo_ident.fitting.free_run import fit, residuals
-from piezo_ident.fitting.stage import PARTS, Stage
+from piezo_ident.fitting.stage import LEAST_SLOPE, PARTS, Stage
 from piezo_ident.fitting.stretch import Stretch
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
@@ -96,6 +96,26 @@ def test_weights_stay_above_zero_and_the_loss_never_grows():
     losses = [fit(rough(stage), measured(stage), iterations=n).loss for n in (0, 1, 3, 8)]
     assert losses == sorted(losses, reverse=True)
     assert fit(rough(stage), measured(stage)).stage.coefficients[:5].min() >= 0.0
+
+
+def test_a_slope_below_its_bound_is_no_end():
+    # as a gain of G that went into H leaves it, or a wider law makes of the same powers of v
+    c = np.array([0.2, 0.0, 0.15, 0.1, 0.05, 0.0, 0.6 * LEAST_SLOPE])
+    stage = replace(truth(), coefficients=c)
+    start = replace(stage, coefficients=np.r_[0.5 * c[:5], c[5:]])
+    found = fit(start, measured(stage), iterations=30)
+    assert found.rms == pytest.approx(NOISE, rel=0.05)
+
+
+def test_H_rises_with_lags_along_the_path_that_would_let_it_fall():
+    law = HysteresisLaw('duhem', R)
+    stage = truth().with_law(law)
+    falls = replace(stage, coefficients=stage.coefficients.copy())
+    falls.coefficients[law.densities] += 0.3
+    assert falls.hysteresis.lowest_slope() < -0.1
+    start, found = (fit(stage, measured(falls), iterations=n) for n in (0, 8))
+    assert found.stage.hysteresis.lowest_slope() > 0.0
+    assert found.rms < 0.2 * start.rms
 
 
 def test_deviations_are_those_of_repeated_noise():
