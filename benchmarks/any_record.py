@@ -284,7 +284,7 @@ def drive_fault(model: pi.StageModel, rng: np.random.Generator) -> str:
     Return what is wrong with H or the drive of an inverse, nothing where all is well.
 
     H has to rise on its range.  Under `slow_motion` the drive may be 1.2 times as wide as that of
-    the model without G, and its largest step 1.2 times as large.  A refusal names the model.
+    the model without G, and its largest step 1.2 times as large.  A refusal is a fault, too.
     """
     if model.hysteresis.lowest_slope() <= 0.0:
         return 'H falls'
@@ -294,7 +294,7 @@ def drive_fault(model: pi.StageModel, rng: np.random.Generator) -> str:
         still = replace(model, dynamics=Dynamics.unit(), delay=Delay(0), effects=())
         static = pi.invert(still, wanted).v
     except ModelError as error:
-        return '' if 'model' in str(error) else f'refuses: {error}'
+        return f'refuses: {error}'
     if np.ptp(drive) > 1.2 * np.ptp(static):
         return f'drive {np.ptp(drive) / np.ptp(static):.2f} times as wide'
     steps = [float(np.abs(np.diff(v)).max()) for v in (drive, static)]

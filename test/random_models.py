@@ -42,7 +42,7 @@ def falling_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
     if curves is not None:
         # its weight falls to 0.6 of itself over the span
         curves = np.vstack([[-0.2 * weight, 0.0, 0.0], curves])
-    return replace(
+    falls = replace(
         h,
         thresholds=np.append(0.001, h.thresholds),
         weights=np.append(weight, h.weights),
@@ -50,6 +50,8 @@ def falling_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
         curves=curves,
         bias=None if bias is None else np.append(0.0, bias),
     )
+    # the lowest slope may be that of a sweep with lags, where the narrowest play moves, too
+    return falls if falls.lowest_slope() <= 0.0 else falling_hysteresis(rng, law)
 
 
 def random_path(rng: np.random.Generator, n: int) -> np.ndarray:

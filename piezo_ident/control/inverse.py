@@ -188,7 +188,7 @@ def invert(
     ends = float(s.u(low)), float(s.u(high))
     inverted, warnings_of_h = with_rising_hysteresis(model)
     H, linear = _of_hysteresis(inverted, ends, slew / s.V / model.sample_rate)
-    Q = linear_inverse(linear)
+    Q = linear_inverse(linear, iterated=True)
     low, high = map(s.v, H.limits)
     if not low < high:
         raise DataError(

@@ -19,7 +19,7 @@ feedforward under plant uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
 
@@ -52,6 +52,9 @@ SHORTEST, LONGEST, OF_DELAY = 1 << 11, 1 << 19, 8
 #: what a shortened filter may miss before the present sample, as a share of the sum of its
 #: magnitudes, and its most samples there
 MISSED, MOST_BEHIND = 1e-6, 8192
+#: corner of what no filter is long enough for [1 / `LONGEST`]: a quarter of it holds so many time
+#: constants as `OUTSIDE` takes; and its share of the static gain that an iteration makes up for
+SLOW, LITTLE = -4.0 * math.log(OUTSIDE) / (2.0 * math.pi), 0.2
 #: damping below which a mode rings
 RINGS = 0.2
 #: delays of the model that a preview must reach for the filter to be worth anything
@@ -93,12 +96,13 @@ class LinearInverse:
         return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
 
 
-def linear_inverse(model: StageModel) -> LinearInverse:
+def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInverse:
     """
     Return the inverse of all that is linear and fast in a model: G, the delay, and their changes.
 
     Its static gain is exact.  ModelError when G has no static gain, or rings or waits for longer
-    than `LONGEST` samples.
+    than `LONGEST` samples.  Where an iteration makes up for it, as for creep, a little that G does
+    more slowly than that may be left out, with its share of the static gain.
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
@@ -125,6 +129,11 @@ def linear_inverse(model: StageModel) -> LinearInverse:
             # the static gain of the whole model without effects; what they change is small
             return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - start, stop - 1 - n // 2)
         n *= 2
+    faster = model.dynamics.without_slow_poles(
+        SLOW * model.sample_rate / LONGEST, model.sample_rate
+    )
+    if iterated and 0.0 < abs(faster.gain / gain - 1.0) < LITTLE:
+        return linear_inverse(replace(model, dynamics=faster))
     a, b = model.dynamics.a, model.dynamics.b
     radii = np.abs(np.concatenate([np.roots(np.append(1.0, a)), np.roots(b)]))
     slowest = min(radii, key=lambda r: abs(r - 1.0), default=0.0)
