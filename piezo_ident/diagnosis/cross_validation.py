@@ -18,14 +18,7 @@ import itertools
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import (
-    HARM,
-    HARM_OF_REFIT,
-    OF_SHAPE,
-    STANDARD_ERRORS,
-    TYPICAL_LEFT,
-)
-from piezo_ident.diagnosis.rows import centred, Rows
+from piezo_ident.diagnosis.rows import Rows
 
 #: share of a column's own energy that is added to the diagonal: keeps collinear columns small
 RIDGE = 1e-9
@@ -169,75 +162,3 @@ def held_out_residual(
         here = out[rows.block]
         left[here] -= (M @ theta[:, 0])[here]
     return left
-
-
-def standard_errors(difference: Array) -> float:
-    """
-    Return a sum over blocks, shape (blocks,), in units of its standard error.
-
-    Blocks count as independent.  Errors of two models on the same blocks are compared block by
-    block, so what makes a block hard for both cancels.
-
-    >>> round(standard_errors(np.array([3.0, 1.0, 2.0, 2.0])), 2)
-    4.9
-    """
-    total = float(difference.sum())
-    if total == 0.0 or difference.size < 2:
-        return 0.0
-    deviation = float(np.sqrt(difference.size * difference.var(ddof=1)))
-    return total / deviation if deviation > 0.0 else float(np.copysign(np.inf, total))
-
-
-def fitted_gain(rows: Rows, x: Array, e: Array) -> tuple[float, float]:
-    """
-    Return the gain of x that lowers its error e most, and the sum of squares that it takes off e.
-
-    Both without the means of the records.
-    """
-    h, e = centred(x, rows.of_record), centred(e, rows.of_record)
-    share = float(h @ e) / float(h @ h)
-    return 1.0 + share, share * float(h @ e)
-
-
-def refit_holds(rows: Rows, given: Array, transfer: Array) -> bool:
-    """
-    Return whether a refit of H predicts held-out kinds of excitation better than the given model.
-
-    A drift, or steps of the converter, lower the error of a refit on blocks between those that
-    were fitted; a kind of excitation that was left out as a whole shows whether H is better.  An
-    offset of each record is no merit of the refit.  Nor is, without labels, a gain where the error
-    is large, most often at fast motion, at the cost of most other motion: the next record may hold
-    more of that.
-
-    `given` is the residual of the model as given, shape (n,), and `transfer` the sum of squares of
-    each block by the refit, whole kinds held out.
-    """
-    squares = centred(given, rows.of_record) ** 2
-    before = np.bincount(rows.block, squares, minlength=rows.group.size)
-    if standard_errors(before - transfer) < STANDARD_ERRORS:
-        return False
-    change = np.bincount(rows.group, transfer - before, len(rows.labels))
-    # without labels parts of a record stand for kinds
-    harm = HARM_OF_REFIT if rows.kinds else HARM
-    if change[change > 0.0].sum() > -harm * change.sum():
-        return False
-    if rows.kinds:
-        return True
-    errs = before > 0.0
-    left = np.maximum(transfer[errs] / before[errs], np.finfo(np.float64).tiny)
-    return bool(np.mean(np.log(left)) <= 2.0 * np.log(TYPICAL_LEFT))
-
-
-def takes_shape(rows: Rows, given: Array, held_out: Array, noise: float) -> bool:
-    """
-    Return whether a refit of H predicts the path within blocks better, not only their means.
-
-    Where loops move on with every round, a refit learns where they were.  In this record that
-    holds for the blocks between, too, and in the next one loops are elsewhere; their shape is
-    the same.
-
-    `given` is the residual of the model as given and `held_out` the one of a refit to other
-    blocks, shape (n,); `noise` is the mean square of the noise of a row.
-    """
-    before, after = (float(np.mean(centred(e, rows.block) ** 2)) for e in (given, held_out))
-    return before - after >= OF_SHAPE * max(before - noise, 0.0)

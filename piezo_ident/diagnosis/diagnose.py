@@ -5,11 +5,12 @@
 From a model and measured data to the effect that the model lacks.
 
 1. Faults of the data are found and left out.
-2. The base model is refitted by free-run error, so that no effect is blamed for a weight of H.
+2. H is refitted by free-run error, so that no effect is blamed for a weight of H.
 3. The lines and the noise floor of what is left give what there is to explain.
-4. Effects are added one after another as long as data that were not fitted gain
-   (`forward_selection`, of rounds of `search`).
-5. The verdict is given (`verdict`), and the model is refined by what holds (`refined_model`).
+4. The candidates are fitted: H and G in each way, with each effect, then with one more
+   (`candidates`, of rounds of `search`).
+5. One ratio decides (`decision`), a walk over whole kinds of motion gives H (`refits`), and the
+   verdict (`verdict`) and the refined model (`refined_model`) say what holds.
 """
 
 from __future__ import annotations
@@ -19,14 +20,12 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
-from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.base_refit import effects_beside, refits
-from piezo_ident.diagnosis.conclusion import conclude
+from piezo_ident.diagnosis.candidates import CandidateSearch
+from piezo_ident.diagnosis.decision import decide
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
-from piezo_ident.diagnosis.forward_selection import ForwardSelection
 from piezo_ident.diagnosis.found_effects import found_effects
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.known_error import missed_now, missed_then
+from piezo_ident.diagnosis.known_error import missed_now
 from piezo_ident.diagnosis.messages import (
     left_over,
     part_judged,
@@ -35,6 +34,7 @@ from piezo_ident.diagnosis.messages import (
     warnings_of,
 )
 from piezo_ident.diagnosis.refined_model import refine, Refined
+from piezo_ident.diagnosis.refits import law_of, refits, walk
 from piezo_ident.diagnosis.results import (
     Diagnosis,
     DiagnosisSettings,
@@ -42,14 +42,15 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.diagnosis.rows import centred, make_rows, means
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import CREEP, State
+from piezo_ident.diagnosis.state import CREEP, State, TESTED
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
     errors_of_laws,
-    set_aside,
+    judge,
     smallest_detectable,
     untestable_of,
 )
+from piezo_ident.effects import catalogue
 from piezo_ident.identification.prepare import filled_in, same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.metrics import REVERSED, runs_against
@@ -74,6 +75,12 @@ from piezo_ident.residual import (
 
 #: effect that is looked for by its lines
 HUM = 'periodic_disturbance'
+#: share of the voltage range below which the command is at rest but for noise
+TREMBLES = 0.01
+#: share of the variance beyond which the displacement does not follow the voltage
+UNRELATED = 0.99
+#: correlation with the model below which no change of the stage can be the cause
+AGAINST = -0.9
 
 
 def diagnose(
@@ -221,7 +228,7 @@ def _diagnosed(
         rows = replace(rows, runs=runs, x=rows.of([run.x for run in runs]))
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    # 2. the base model refitted, as plays and as the widest law
+    # 2. H refitted, as plays and as the widest law
     # a sensor may have been set to zero again since: an offset of each record is no error
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
@@ -239,66 +246,55 @@ def _diagnosed(
     noise -= excess
     single = None if single is None else single - excess
     progress('residual', 1.0)
-    # 4. effects, one after another
-    frequencies = [line.frequency for line in lines.lines]
-    # another axis makes lines, too: what its model leaves is hum
-    shown = ['cross_coupling'] * any(test.significant for test in channels)
-    shown += [HUM] * bool(frequencies)
-    misfit = rows.percent(plays.mean_square - wide.mean_square)
-    misses = missed_now(simulator)
-    # what a wider law adds, and what a refit takes or loses: H fits no better than that
-    doubt = max(misfit, rows.percent(abs(left - plays.mean_square)))
-    search = ForwardSelection(
+    # 4. the candidates
+    have = {setting.name for setting in model.effects}
+    names = [n for n in settings.effects or catalogue() if n not in {*settings.without, *have}]
+    search = CandidateSearch(
         simulator,
-        frequencies,
+        given,
+        [line.frequency for line in lines.lines],
         noise,
-        settings,
-        progress,
-        certain=shown,
-        smallest=max(criteria.SMALLEST_EFFECT, criteria.OF_MISFIT * doubt),
-        missed=missed_then(model),
-        misses=misses,
-        misfit=misfit,
-        given=left,
+        missed_now(simulator),
+        [name for name in names if name not in TESTED],
+        np.random.default_rng(settings.seed),
+        lambda share: progress('candidates', share),
     )
-    base, selected = effects_beside(simulator, given, search, plays, wide)
-    refitted = selected.fitted
-    # what set in since is sought beside the given H, and all else beside a refitted one
-    smallest = smallest_detectable(rows, base, selected, noise)
-    # 5. the verdict, and what holds
-    squares = noise, noise if single is None else single
+    # another axis makes lines, too: what its model leaves is hum
+    tests = {
+        'cross_coupling': any(test.significant for test in channels),
+        HUM: bool(lines.lines),
+    }
+    base, shown = search.shown(wide, [n for n, is_seen in tests.items() if is_seen and n in names])
+    candidates = search.of(plays, base, settings.most_effects - len(shown))
+    progress('candidates', 1.0)
 
+    # 5. the decision, and what holds
     def tick() -> None:
         progress('verdict', 0.5)
 
-    # which may search for one more effect
-    found = conclude(simulator, given, search, base, selected, squares, misfit, tick)
-    tick()
-    findings, selected, last = found.findings, found.selected, found.last
+    decision = decide(candidates)
+    last = walk(simulator, given, candidates, decision.best, tick)
+    untried = set(catalogue()) - set(names) - have
+    findings = judge(candidates, decision, last, shown, wide.mean_square, untried)
     # what single samples have more of noise than rows
     lost = 0.0 if single is None else max(single - noise, 0.0)
+    without = wide if shown else candidates.without().fitted
     before, refit, after = (
         rows.errors(e, lost)
         for e in (
             rows.x - simulator.run(given),
-            base.held_out_residual(rows),
-            last.held_out_residual(rows, rows.group),
+            without.held_out_residual(rows),
+            last.fitted.held_out_residual(rows, rows.group),
         )
     )
-    refined = refine(simulator, given, last, findings, noise, (before, after))
+    refined = refine(simulator, given, last, findings, (before, after))
     if refined.is_given:
         after = before
-        if findings.verdict == 'refitted':
-            # of a refit that is not kept
-            findings = findings.unsettled(rows.percent(left - noise))
-    rest = findings.unexplained(left_over(findings, smallest, rows.passes))
+    smallest = smallest_detectable(candidates, findings)
     # where no line stands out, and no channel, there is nothing to fit
     tested = {HUM} if lines.searched else set()
     tested |= {'cross_coupling'} if any(test.tells for test in channels) else set()
-    tested |= {*settings.without, *(setting.name for setting in model.effects)}
-    aside = set_aside(rows, selected, settings, noise, misses, tested)
-    explainable = max(base.mean_square - noise, 1e-300)
-    bent = (base.mean_square - selected.rounds[0].before.mean_square) / explainable
+    tested |= {*settings.without, *have}
     crept = rows.percent(float(np.max(simulator.crept(refined.state) ** 2)))
     progress('verdict', 1.0)
     return Diagnosis(
@@ -306,32 +302,32 @@ def _diagnosed(
         sentence='',
         given=model,
         model=refined.model,
-        effects=found_effects(rows, found.before, selected, found.explainable, last),
+        effects=found_effects(rows, findings, last.fitted),
         group=findings.group,
-        unexplained=rest,
-        candidates=candidates_of(rows, selected.rounds, findings, noise, aside),
+        unexplained=findings.unexplained(left_over(findings, smallest, rows.passes)),
+        candidates=candidates_of(candidates, search.rounds, findings),
         before=before,
         refit=refit,
         after=after,
         noise_floor=None if single is None else rows.percent(single),
         noise_source=floor.source,
         smallest_detectable=smallest,
-        untestable=untestable_of(selected.rounds, settings, {*tested, *aside}),
+        untestable=untestable_of(search.rounds, settings, tested),
         faults=faults.faults,
-        residuals=_residuals(simulator, given, base, refined),
+        residuals=_residuals(simulator, given, without.state, refined),
         records=rows.names,
         blocks=int(rows.fold.size),
         warnings=(
             *part_judged(rows),
-            *warnings_of(model, refined, findings, floor, bent, crept),
-            *(warning for one in selected.rounds for warning in one.warnings),
+            *warnings_of(model, refined, floor, crept),
+            *(warning for one in search.rounds for warning in one.warnings),
         ),
         settings=settings,
-        law='' if refined.keeps_h or last.state.law is None else last.state.law.name,
-        errors_of_laws=errors_of_laws(rows, (refitted, last, plays, wide)),
+        law='' if refined.keeps_h or last.way == 'gain' else law_of(last.fitted),
+        errors_of_laws=errors_of_laws(candidates),
         kinds=rows.kinds,
-        is_of_refit=findings.of_refit > 0.0,
         gain=findings.gain,
+        set_in=decision.set_in,
     )
 
 
@@ -364,11 +360,11 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
     rows = simulator.rows
     swing = max(float(np.ptp(run.u)) for run in rows.runs)
     # where the voltage only trembles all else may well be larger
-    if swing <= criteria.TREMBLES:
+    if swing <= TREMBLES:
         return
     names = ', '.join(rows.names)
     moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
-    if base.mean_square > criteria.UNRELATED * moved:
+    if base.mean_square > UNRELATED * moved:
         raise IdentificationError(
             f'{names}: the displacement does not follow the voltage: a hysteresis accounts for '
             f'only {max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it '
@@ -376,7 +372,7 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
         )
     known, of_each = simulator.run(given), (rows.of_record == k for k in np.unique(rows.of_record))
     # that the voltage moves is known here
-    if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, criteria.AGAINST):
+    if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, AGAINST):
         raise IdentificationError(f'{names}: {REVERSED}')
 
 
@@ -384,12 +380,12 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
 
 
 def _residuals(
-    simulator: Simulator, given: State, base: Fitted, refined: Refined
+    simulator: Simulator, given: State, without: State, refined: Refined
 ) -> tuple[Residual, ...]:
     Y = simulator.model.scaling.Y
     # of a refit alone there is no model between the given and the refined one
     is_refit = not refined.is_given and not refined.state.effects
-    before = refined.state if is_refit else base.state
+    before = refined.state if is_refit else without
     full = [simulator.full(s) for s in (given, before, refined.state)]
     residuals = []
     for i, run in enumerate(simulator.rows.runs):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     normal_equations,
@@ -28,6 +28,9 @@ from piezo_ident.diagnosis.polishing import with_fresh_columns
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
+
+#: share of the rms error of held-out blocks that may be left with what creeps on from before
+EARLIER_LEAVES = 0.5
 
 
 def with_earlier_motion(
@@ -55,7 +58,7 @@ def with_earlier_motion(
     except IdentificationError:
         # what cannot be fitted is not there
         return fitted
-    is_better = crept.mean_square <= criteria.EARLIER_LEAVES**2 * fitted.mean_square
+    is_better = crept.mean_square <= EARLIER_LEAVES**2 * fitted.mean_square
     return crept if is_better and _is_possible(simulator, crept.state) else fitted
 
 
@@ -66,7 +69,7 @@ def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
     both = with_columns(rows, normal_equations(rows, M, E), M, C, E)
     prior = np.append(fitted.prior[fitted.free], np.full(C.shape[1], cost_of_decays(rows)))
     left = float(held_out_errors(both, rows.fold, prior).sum())
-    return left <= 0.5 * (1.0 + criteria.EARLIER_LEAVES**2) * float(fitted.errors.sum())
+    return left <= 0.5 * (1.0 + EARLIER_LEAVES**2) * float(fitted.errors.sum())
 
 
 def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any]:
@@ -87,7 +90,7 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
     # faster elements make up for dynamics
     gain = float(gains[times > AT_ONCE].sum())
-    doubt = np.sqrt(rows.square(criteria.SMALLEST_EFFECT))
+    doubt = np.sqrt(rows.square(SMALLEST_EFFECT))
     starts = {k: run.u[0] for run, k in reversed([*zip(rows.runs, rows.record, strict=True)])}
     ends = gain * (np.array(rows.reach) - np.array([[starts[k]] for k in sorted(starts)]))
     left = state.earlier.sum(axis=1)

@@ -10,30 +10,20 @@ from piezo_ident.diagnosis.cross_validation import normal_equations, summed
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.results import FoundEffect, FoundParameter
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.search import Selected
+from piezo_ident.diagnosis.verdict import Findings
 
 
-def found_effects(
-    rows: Rows, base: Fitted, selected: Selected, explainable: float, last: Fitted
-) -> tuple[FoundEffect, ...]:
+def found_effects(rows: Rows, findings: Findings, last: Fitted) -> tuple[FoundEffect, ...]:
     """
     Return the effects that were added, with parameters as in the record with most rows.
 
-    `explainable` is the mean square that there was to explain, and `last` the fit that the refined
-    model comes from.
+    `last` is the fit that the refined model comes from.
     """
-    if not selected.taken:
+    if not findings.effects:
         return ()
     std = _standard_deviations(rows, last)
-    ends = [this.contenders[0].mean_square for this in selected.taken[:-1]]
-    starts = ends
-    if last.state.fading:
-        # what crept on from before is no gain of an effect that was added after it
-        starts = [this.before.mean_square for this in selected.taken[1:]]
-    starts, ends = [base.mean_square, *starts], [*ends, selected.fitted.mean_square]
     found = []
-    for i, (added, level, left) in enumerate(zip(last.state.effects, starts, ends, strict=True)):
-        gain = max(level - left, 0.0)
+    for i, (added, gain) in enumerate(zip(last.state.effects, findings.gains, strict=True)):
         values = added.values[rows.longest]
         parameters = {}
         for p in added.effect.parameters:
@@ -49,7 +39,7 @@ def found_effects(
             FoundEffect(
                 name=added.name,
                 slot=added.effect.slot,
-                share=float(np.clip(gain / explainable, 0.0, 1.0)),
+                share=float(np.clip(gain / findings.explainable, 0.0, 1.0)),
                 rms_percent=rows.percent(gain),
                 parameters=parameters,
             )

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.criteria import EARLIER_COST, WEIGHT_SPREAD, WIDE_SPREAD, WIDER
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     held_out_residual,
@@ -39,6 +38,11 @@ DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 LEAST_RATIO = 0.5
 #: share of what shows a parameter that other kinds of excitation must hold to tell it
 FIRM = 0.01
+#: expected size of a weight of H, and of its other coefficients, normalised: the prior that keeps
+#: collinear plays small
+WEIGHT_SPREAD, WIDE_SPREAD = 0.1, 1.0
+#: what creeps on from before a record costs a fit as much as an error of so much of it
+EARLIER_COST = 0.003
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
 
@@ -234,24 +238,6 @@ def fit_jointly(
         transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
         pull=own,
     )
-
-
-def is_better(wide: Fitted, narrow: Fitted) -> bool:
-    """Return whether a wider fit predicts clearly better, both held-out blocks and whole kinds."""
-    return _predicts(wide) < WIDER**2 * _predicts(narrow)
-
-
-def may_be_better(wide: Fitted, narrow: Fitted) -> bool:
-    """
-    Return whether a fit between the two may predict clearly better than the narrow one.
-
-    What was not fitted it predicts no better than the widest fits it.
-    """
-    return float(wide.e @ wide.e) < WIDER**2 * _predicts(narrow)
-
-
-def _predicts(fitted: Fitted) -> float:
-    return float(np.sqrt(fitted.errors.sum() * fitted.transfer.sum()))
 
 
 def _to_come(gain: float, last: float, more: int) -> float:

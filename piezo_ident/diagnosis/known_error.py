@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.criteria import IN_PROPORTION
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.identification.spectra import high_passed
 from piezo_ident.model.stage_model import StageModel
@@ -38,7 +38,7 @@ def missed_now(simulator: Simulator) -> float:
         return missed
     fast = [high_passed(run.x, run.piece.sample_rate)[run.use] for run in simulator.rows.runs]
     now = 100.0 * float(np.sqrt(np.mean(np.concatenate(fast) ** 2)))
-    return missed * max(1.0, criteria.IN_PROPORTION * now / float(then))
+    return missed * max(1.0, IN_PROPORTION * now / float(then))
 
 
 def _entries(model: StageModel, name: str) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import LEAST_GAIN, SMALLEST_EFFECT, TUNED
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.refined_model import Refined
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.diagnosis.rows import Rows
@@ -21,6 +21,8 @@ from piezo_ident.residual.noise_floor import NoiseFloor
 
 #: share of the data that needs no word about the rest
 NEARLY_ALL = 0.9
+#: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
+TUNED = 0.05
 
 
 def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
@@ -32,9 +34,6 @@ def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
         )
     if findings.left < smallest:
         return f'less than these data can tell apart ({smallest:.2g} % of stroke)'
-    if findings.keeps_given:
-        what = 'gain' if findings.gain else 'hysteresis'
-        return f'another {what} would take most of it here'
     if findings.verdict == 'none':
         return 'no effect is claimed for what differs from one part of the data to another'
     if not findings.effects:
@@ -65,33 +64,20 @@ def part_judged(rows: Rows) -> list[str]:
     ]
 
 
-def warnings_of(
-    given: StageModel,
-    refined: Refined,
-    findings: Findings,
-    floor: NoiseFloor,
-    bent: float,
-    crept: float,
-) -> list[str]:
+def warnings_of(given: StageModel, refined: Refined, floor: NoiseFloor, crept: float) -> list[str]:
     """
     Return what a user of the refined model must know.
 
-    `bent` is the share of the explainable part that goes with a retuned G alone, and `crept` the
-    most that crept on from before a record, % of stroke.
+    `crept` is the most that crept on from before a record, % of stroke.
     """
     state = refined.state
     found = []
     if not floor.known:
         found.append(f'{floor.source}: every share counts the noise as unexplained')
     if not refined.is_given and np.any(np.abs(state.retuning) > TUNED):
-        why = (
-            f', and {100.0 * bent:.0f} % of what a refit of the hysteresis leaves goes with that '
-            'alone: they were off at the identification, by an effect or for lack of fast motion, '
-            'or they have changed since'
-        )
         found.append(
-            'the dynamics were retuned in the band that the data drive'
-            f'{why if bent >= LEAST_GAIN else ""}'
+            'the dynamics were retuned in the band that the data drive: they were off at the '
+            'identification, or they have changed since'
         )
     if state.fading:
         found.append(
@@ -124,7 +110,7 @@ def _of_time_driven(added: Added, h_is_given: bool) -> str:
     kept = 'it switched off' if is_off else 'its mean'
     if added.name == WANDERS:
         kept = 'the gain of the given one'
-    if h_is_given:
+    if h_is_given and is_off:
         kept = 'it switched off, and the hysteresis as it was given'
     return (
         f'{added.name} follows time and not the voltage: what was found holds in its own '
@@ -135,10 +121,10 @@ def _of_time_driven(added: Added, h_is_given: bool) -> str:
 def sentence(result: Diagnosis) -> str:
     """Return what was found, what became of the model, and what the data leave open."""
     outcome = _outcome(result)
-    texts = ['; '.join(filter(None, (_finding(result, outcome), outcome)))]
+    texts = ['; '.join(filter(None, (_finding(result), outcome)))]
     if result.group and not result.effects:
         hidden = _or(result.group.names)
-        texts.append(f'{hidden} may hide in the base model, and these data do not tell')
+        texts.append(f'{hidden} may hide in that hysteresis, and these data do not tell')
     elif result.group and result.verdict == 'partly_explained':
         texts.append(f'whether it is {_or(result.group.names)}, these data do not tell')
     if result.outside:
@@ -150,8 +136,8 @@ def sentence(result: Diagnosis) -> str:
     return ' '.join(f'{text[0].upper()}{text[1:]}.' for text in texts)
 
 
-def _finding(result: Diagnosis, outcome: str) -> str:
-    """Return what the verdict says, where the outcome does not."""
+def _finding(result: Diagnosis) -> str:
+    """Return what the verdict says."""
     rest, smallest = result.unexplained, result.smallest_detectable
     if result.effects:
         explained = _explained(result)
@@ -161,18 +147,15 @@ def _finding(result: Diagnosis, outcome: str) -> str:
             return f'{explained}, {rest.rms_percent:.2g} % of stroke stays unexplained'
         return explained
     if result.verdict == 'refitted':
-        return 'the hysteresis of the model is not that of these data'
-    if result.verdict == 'unexplained':
-        stays = f'{rest.rms_percent:.2g} % of stroke stays unexplained'
         if result.gain:
             share, gain = 100.0 * result.gain.share, result.gain.value
             return (
-                f'{stays}: {share:.0f} % of it would go with a gain that is {gain:.4g} times what '
-                'it was'
+                f'the gain is {gain:.4g} times that of the model, which explains {share:.0f} % of '
+                'what the model missed'
             )
-        # the outcome tells what would take it
-        is_told = outcome and rest.rms_percent > result.refit.overall
-        return stays if is_told else f'{stays}: {rest.description}'
+        return 'the hysteresis of the model is not that of these data'
+    if result.verdict == 'unexplained':
+        return f'{rest.rms_percent:.2g} % of stroke stays unexplained: {rest.description}'
     if smallest is None:
         return rest.description
     if rest.rms_percent >= smallest:
@@ -189,9 +172,7 @@ def _finding(result: Diagnosis, outcome: str) -> str:
 def _explained(result: Diagnosis) -> str:
     """Return which effects explain how much of what."""
     missed = 'what the model missed'
-    if result.is_of_refit and len(result.effects) == 1:
-        missed = 'what a refit of the hysteresis takes'
-    elif not result.is_of_refit and result.refit.overall < 0.5 * result.before.overall:
+    if not result.set_in and result.refit.overall < 0.5 * result.before.overall:
         # shares are of what a refit leaves: a sensor set to zero again is no effect
         missed = 'what a refit of the hysteresis leaves'
     names = ' and '.join(effect.name.replace('_', ' ') for effect in result.effects)
@@ -209,14 +190,15 @@ def _outcome(result: Diagnosis) -> str:
         if any(find_effect(effect.name).time_driven for effect in result.effects):
             fall += ' in these records alone'
         if not result.effects:
-            return f'after a refit of the hysteresis {fall}'
-        is_larger = not result.is_of_refit and refit < 0.5 * before
-        return f'{fall}, with the refit alone to {refit:.3g} %' if is_larger else fall
-    stays = f'in another record, so the model stays as given ({before:.3g} % of stroke)'
-    if result.effects:
-        return f'what was found need not hold {stays}'
+            what = 'with that gain' if result.gain else 'after a refit of the hysteresis'
+            return f'{what} {fall}'
+        is_larger = not result.set_in and refit < 0.5 * before
+        return f'{fall}, with a refit alone to {refit:.3g} %' if is_larger else fall
     if before > np.hypot(refit, SMALLEST_EFFECT):
-        return f'a refit of the hysteresis leaves {refit:.3g} % here, which need not hold {stays}'
+        return (
+            f'a refit of the hysteresis leaves {refit:.3g} % of blocks between those fitted, but '
+            f'not of other motion, so the model stays as given ({before:.3g} % of stroke)'
+        )
     return ''
 
 

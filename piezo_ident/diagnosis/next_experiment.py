@@ -243,13 +243,6 @@ LOOK_ALIKES = (
     # both act where a full stroke turns
     ('backlash', 'saturation'),
 )
-#: laws that another one can take the shape of, to first order, whatever the data
-CONTAINS = {
-    # any change of the dynamics
-    'changed_dynamics': ('delay_change', 'amplifier_lag', 'input_feedthrough'),
-    # thresholds that grow in proportion to the speed are a delay
-    'rate_dependent_hysteresis': ('delay_change', 'amplifier_lag'),
-}
 _HOLDS = 'holds of 10 s and more after steps of both signs, with the first motion at the end again'
 _TWO_SIZES = 'a sine near the first resonance at two amplitudes, one a tenth of the other'
 _FAST = 'a multisine that reaches beyond the first resonance'

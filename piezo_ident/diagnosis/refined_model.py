@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.cross_validation import fitted_gain, refit_holds, takes_shape
-from piezo_ident.diagnosis.forward_selection import TESTED
+from piezo_ident.diagnosis.criteria import MOVED_ZERO
 from piezo_ident.diagnosis.joint_fit import Fitted
+from piezo_ident.diagnosis.refits import Step
 from piezo_ident.diagnosis.results import Errors, FORMULA
 from piezo_ident.diagnosis.rows import centred, means, Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import Added, State, WANDERS
+from piezo_ident.diagnosis.state import Added, DRIFT, State, TESTED, WANDERS
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import expected_error
@@ -54,58 +53,32 @@ def lasting(effects: tuple[str, ...]) -> list[str]:
 def refine(
     simulator: Simulator,
     given: State,
-    fitted: Fitted,
+    last: Step,
     findings: Findings,
-    noise: float,
     errors: tuple[Errors, Errors],
 ) -> Refined:
     """
-    Return the model that the user gets, from a refit with what was found.
+    Return the model that the user gets, from the last step of the walk with what was found.
 
-    `noise` is the mean square of the noise of a row; `errors` are those of the model as given and
-    of the refit, which the file will tell.
+    `errors` are those of the model as given, and of that step: the file tells them.
     """
     rows, model = simulator.rows, simulator.model
+    fitted, h_is_given = last.fitted, last.way == 'given'
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
-    metres = shifts * model.scaling.Y
-    stays = findings.keeps_given or findings.may_follow_time
-    if not (stays or findings.effects):
-        # no motion held out speaks for a refit where nothing is missing
-        stays = findings.verdict == 'none' and not rows.kinds
-        stays = stays or not _is_worth(rows, fitted, e, noise)
-        stays = stays or _harms_the_whole(simulator, given, fitted.state)
-    if stays:
-        return Refined(model, given, metres, is_given=True)
-    worth = criteria.WORTH_REFIT
-    if not rows.kinds:
-        # no other kind of motion speaks for it
-        worth = criteria.WORTH_UNLABELLED[bool(findings.effects)]
-    if fitted.transfer.sum() > (1.0 - worth) ** 2 * (e @ e):
-        # of a kind of excitation that was not fitted the given model knows as much
-        return Refined(model, given, metres, is_given=True)
+    if h_is_given and not findings.effects:
+        return Refined(model, given, shifts * model.scaling.Y, is_given=True)
     # beside an effect that was found, a smaller shift shows, too
     hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
     shifts = np.where(shifts == 0.0, hidden, shifts)
-    metres = shifts * model.scaling.Y
-    if shifts.any():
-        offsets = fitted.state.offsets - shifts
-        fitted = replace(fitted, state=replace(fitted.state, offsets=offsets))
+    state = replace(fitted.state, offsets=fitted.state.offsets - shifts)
+    kept = _at_given_gain(simulator, given, state)
+    # what a gain or a drift makes of the next record, these do not tell
     lasts = not findings.effects or bool(lasting(findings.effects))
-    if lasts or _is_finding(simulator, given, fitted):
-        state = _at_given_gain(simulator, given, fitted.state)
-        # what a gain or a drift makes of the next record, these do not tell
-        told = errors if lasts and state is fitted.state else errors[:1]
-        refined = _model(simulator, state, findings, _range(simulator), told)
-        return Refined(refined, fitted.state, metres)
-    # H was refitted together with a drift that another record will not repeat
-    effects = tuple(
-        Added(added.name, tuple(added.effect.neutral(values) for values in added.values))
-        for added in fitted.state.effects
-    )
-    state = replace(given, effects=effects, offsets=np.zeros_like(given.offsets))
-    refined = _model(simulator, state, findings, model.scaling.range, errors[:1])
-    return Refined(refined, fitted.state, metres, h_is_given=True)
+    span = model.scaling.range if h_is_given else _range(simulator)
+    told = errors if lasts and kept is state else errors[:1]
+    refined = _model(simulator, kept, findings, span, told)
+    return Refined(refined, state, shifts * model.scaling.Y, h_is_given=h_is_given)
 
 
 def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
@@ -130,46 +103,6 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     return replace(state, effects=tuple(effects))
 
 
-def _is_finding(simulator: Simulator, given: State, fitted: Fitted) -> bool:
-    """
-    Return whether a refit of H is one beside effects that follow time, not a gain that wanders.
-
-    It takes the larger part of what these leave of the model as given, also of motion held out.
-    """
-    rows, state = simulator.rows, fitted.state
-    x = simulator.run(given)
-    of_time = simulator.run(state) - simulator.run(replace(state, effects=()))
-    e = centred(rows.x - x - of_time, rows.of_record)
-    before, after = float(np.mean(e * e)), float(fitted.transfer.sum()) / rows.n
-    if rows.percent(before - after) < criteria.REFIT_FINDING or after > 0.5 * before:
-        return False
-    by_gain = fitted_gain(rows, x, e)[1] / rows.n
-    return by_gain <= criteria.ADDED * (before - after) and refit_holds(rows, e, fitted.transfer)
-
-
-def _is_worth(rows: Rows, refit: Fitted, e: Array, noise: float) -> bool:
-    """Return whether a refit of H alone errs clearly less than the given model, which leaves e."""
-    least = (1.0 - criteria.WORTH_REFIT) ** 2 * float(np.mean(e * e))
-    return (
-        refit.mean_square <= least
-        and refit_holds(rows, e, refit.transfer)
-        and takes_shape(rows, e, refit.held_out_residual(rows), noise)
-    )
-
-
-def _harms_the_whole(simulator: Simulator, given: State, fitted: State) -> bool:
-    """
-    Return whether a refit errs more than the given model, with the start that was not fitted.
-
-    Of a record that starts anywhere, the part in which the memory is unknown can be the larger.
-    """
-    squares = np.zeros(2)
-    for i, state in enumerate((given, fitted)):
-        for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True):
-            squares[i] += float(run.use.sum()) * float(np.var((run.x - x)[run.use]))
-    return bool(squares[1] > squares[0])
-
-
 def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: Array) -> Array:
     """
     Return by how much the sensor's zero has moved in each record, normalised; zero where not.
@@ -182,7 +115,7 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))
     missed = np.sqrt(rows.square(expected_error(model) or 0.0))
-    limit = criteria.MOVED_ZERO * np.minimum(np.sqrt(before), np.maximum(left, missed))
+    limit = MOVED_ZERO * np.minimum(np.sqrt(before), np.maximum(left, missed))
     state = replace(state, effects=tuple(map(_elsewhere, state.effects)))
     models = [simulator.model_of(state, k) for k in range(limit.size)]
     rest = state.offsets + [_at_rest(m) - _at_rest(model) for m in models]
@@ -207,7 +140,7 @@ def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
     e is the residual of the model as given without the mean, shape (n,).
     """
     rms = np.sqrt(means(e * e, rows.of_record))
-    return np.where(np.abs(given.offsets) > criteria.MOVED_ZERO * rms, given.offsets, 0.0)
+    return np.where(np.abs(given.offsets) > MOVED_ZERO * rms, given.offsets, 0.0)
 
 
 def _range(simulator: Simulator) -> tuple[float, float]:
@@ -234,9 +167,13 @@ def _model(
     kept = tuple(_elsewhere(added) for added in state.effects)
     model = simulator.model_of(replace(state, hysteresis=slim, effects=kept), k)
     scaling = model.scaling
-    # a slow drift and an offset make up for one another: its mean stays when it goes
-    gone = simulator.run(state) - simulator.run(replace(state, effects=kept))
-    offset = float(state.offsets[k]) + float(gone[rows.of_record == k].mean())
+    offset = float(state.offsets[k])
+    if any(added.name in (DRIFT, WANDERS) for added in state.effects):
+        # a slow drift and an offset make up for one another, and the next record need not drift
+        # like this one: the zero stays where it was
+        given = State(simulator.model.hysteresis, np.zeros(len(rows.names)))
+        rest = simulator.run(given) - simulator.run(replace(state, effects=kept))
+        offset += float(rest[rows.of_record == k].mean())
     moved = replace(scaling, y0=scaling.y0 + offset * scaling.Y, range=span)
     provenance = {
         **model.identification,

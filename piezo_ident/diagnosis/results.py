@@ -213,8 +213,8 @@ class Diagnosis(Showable):
     effects : tuple of FoundEffect
         In the order in which they were found.
     group : Class or None
-        Effects that these data cannot tell apart; where none was found, those that
-        may hide in the base model.
+        Effects that these data cannot tell apart; where none was found, those that may hide in
+        the H that was refitted.
     unexplained : Unexplained
     candidates : tuple of Candidate
         Best first.
@@ -245,11 +245,11 @@ class Diagnosis(Showable):
         Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
     kinds : tuple of str
         Kinds of motion held out in turn; empty where parts of the data stood for them.
-    is_of_refit : bool
-        Whether shares, but of candidates that follow time or rate, are of what a refit of H takes,
-        since the effect does that beside the H as given.
     gain : OtherGain or None
-        Where another gain accounts for most of what a refit of H takes.
+        Where another gain does what a refit of H does.
+    set_in : bool
+        Whether an effect has set in since the identification, so that shares are of what the model
+        misses as it was given; else they are of what the H that fits best leaves.
     outside : float
         Share of the samples whose voltage lies outside the range of the given model.
 
@@ -290,8 +290,8 @@ class Diagnosis(Showable):
     law: str = ''
     errors_of_laws: Mapping[str, float] = field(default_factory=dict)
     kinds: tuple[str, ...] = ()
-    is_of_refit: bool = False
     gain: OtherGain | None = None
+    set_in: bool = False
     outside: float = 0.0
 
     @property

@@ -18,8 +18,6 @@ RELAXATIONS = (15.0, 100.0)
 RETUNING = (20.0, 800.0, 1.0, 1.0)
 #: a retuned G follows its law up to so many times the highest frequency that is driven
 BEYOND = 4.0
-#: frequencies at which the squares of a change are taken: a mode that rings for long is narrow
-SQUARES_AT = 20_000
 #: what the product of G and its factor may lose by rounding
 ROUNDING = 1e-4
 
@@ -58,20 +56,6 @@ def retuning_terms(sample_rate: float, band: float) -> Array:
     q, qq = 1.0 - p, (1.0 - p) ** 2
     slow = [(1.0, -1.0, 0.0, a, 0.0) for _, a in _poles(sample_rate)]
     return np.array([(q, -q, 0.0, -p, 0.0), (qq, -2.0 * qq, qq, -2.0 * p, p * p), *slow])
-
-
-def retuning_squares(dynamics: Dynamics, sample_rate: float, band: float) -> Array:
-    """
-    Return M, shape (4, 4): a factor with the coefficients c changes the answer of G by ``c' M c``.
-
-    That is the mean square of the change, under white noise of mean square 1 up to a band [Hz].
-    """
-    f = np.linspace(0.0, min(band, 0.5 * sample_rate), SQUARES_AT + 1)[1:]
-    z = np.exp(-2j * np.pi * f / sample_rate)
-    b0, b1, b2, a1, a2 = retuning_terms(sample_rate, band).T[:, :, None]
-    T = (b0 + b1 * z + b2 * z * z) / (1.0 + a1 * z + a2 * z * z)
-    T *= dynamics.response(f, sample_rate)
-    return np.asarray((T @ T.conj().T).real / f.size)
 
 
 def _limit(sample_rate: float, band: float) -> float:

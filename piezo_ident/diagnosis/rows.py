@@ -17,7 +17,7 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array, closed, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.criteria import COVERED
+from piezo_ident.diagnosis.held_out import are_parts, held_out_kinds, stretches
 from piezo_ident.diagnosis.results import Errors
 from piezo_ident.effects import find_effect
 from piezo_ident.identification.prepare import Run, runs_of
@@ -31,16 +31,14 @@ from piezo_ident.record.gaps import FEW
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means
 
+#: share of the model's voltage range that data must cover for a refitted H to hold in all of it
+COVERED = 0.95
 #: rows a second that keep what steps and noise excite, and the most rows altogether
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
 #: fewest rows that can be cut into blocks
 FEWEST = 500
 #: blocks altogether, about, and how many sets of them are held out in turn
 BLOCKS, FOLDS = 80, 5
-#: whole stretches of one kind that are held out in turn, at most
-GROUPS = 8
-#: name of the kinds that are too small, and of a part of what has one kind alone
-REST, PART = 'the rest', ', part '
 
 Memory = Callable[[Array], Array]
 
@@ -110,8 +108,7 @@ class Rows:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of motion held out in turn; empty where parts of the data stand for them."""
-        parts = all(x == REST or PART in x for x in self.labels)
-        return () if parts else self.labels
+        return () if are_parts(self.labels) else self.labels
 
     @functools.cached_property
     def highest_frequency(self) -> float:
@@ -286,7 +283,7 @@ def make_rows(
     first = 0
     for run, good in zip(runs, keep, strict=True):
         number = np.full(good.size, -1)
-        for label, start, stop in _stretches(run, m):
+        for label, start, stop in stretches(run, m):
             count = max(1, round((stop - start) / longest))
             for part in np.array_split(np.arange(start, stop), count):
                 if good[part].any():
@@ -300,7 +297,7 @@ def make_rows(
         [np.full(int(good.sum()), k) for good, k in zip(keep, record, strict=True)]
     )
     block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
-    group, group_labels = _groups(labels, np.bincount(block))
+    group, group_labels = held_out_kinds(labels, _blocks_of(runs, keep, m, block))
     first_of = {run.record: run.piece.start_time for run in reversed(runs)}
     begin = np.array([0.0 if _has_clock(model) else first_of[run.record] for run in runs])
     return Rows(
@@ -338,51 +335,10 @@ def _whole_rows(known: Mask, m: int) -> Mask:
     return np.asarray((whole == m) & (2 * counts >= m))
 
 
-def _stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
-    """Return label, first row and end of the segments of a run; everything belongs to one."""
-    n = run.piece.n // m
-    if not run.piece.segments:
-        # without labels, parts of the time stand for kinds
-        edges = np.linspace(0, n, GROUPS + 1).astype(int)
-        names = [f'{run.record}{PART}{i + 1}' for i in range(GROUPS)]
-        return [
-            (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
-        ]
-    found: list[tuple[str, int, int]] = []
-    end = 0
-    for s in run.piece.segments:
-        start, stop = max(end, s.start // m), min(n, s.stop // m)
-        if start > end:
-            found.append(('ramp', end, start))
-        if stop > start:
-            found.append((s.label, start, stop))
-            end = stop
-    if end < n:
-        found.append(('ramp', end, n))
-    return found
-
-
-def _groups(labels: Sequence[str], sizes: Integers) -> tuple[Integers, tuple[str, ...]]:
-    """Return which blocks make a stretch of one kind; the smallest kinds are put together."""
-    size: dict[str, int] = {}
-    for label, n in zip(labels, sizes, strict=True):
-        size[label] = size.get(label, 0) + int(n)
-    large = sorted(size, key=lambda label: -size[label])
-    large = [label for label in large if label.partition(':')[0] not in ('idle', 'ramp')]
-    names = large if len(large) < GROUPS else large[: GROUPS - 1]
-    number = {label: i for i, label in enumerate(names)}
-    rest = len(names)
-    group = np.array([number.get(label, rest) for label in labels])
-    if np.any(group == rest):
-        names = [*names, REST]
-    few = all(PART in name for name in names) and len(names) < GROUPS // 2
-    if len(names) == 1 or few:
-        # of one kind, or where most of a record is not judged, nothing would be left to predict
-        # from: parts of what is judged stand for kinds
-        whole = ' and '.join(dict.fromkeys(name.partition(PART)[0] for name in names))
-        group = np.arange(group.size) * GROUPS // group.size
-        names = [f'{whole}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
-    return group, tuple(names)
+def _blocks_of(runs: Sequence[Run], keep: Sequence[Mask], m: int, block: Integers) -> list[Array]:
+    """Return the command of each block, means over rows."""
+    u = np.concatenate([block_means(r.u, m)[good] for r, good in zip(runs, keep, strict=True)])
+    return np.split(u, np.flatnonzero(np.diff(block)) + 1)
 
 
 def _memory(model: StageModel, run: Run, at_rest: bool) -> Memory:

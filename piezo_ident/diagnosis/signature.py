@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
-from piezo_ident.diagnosis import criteria
+from piezo_ident.diagnosis.criteria import SHOWS, STANDARD_ERRORS
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -38,16 +38,6 @@ LOCAL = 0.25
 
 #: rows, shape (k,), and columns of what may differ there, shape (k, p)
 Place = tuple[Integers, Array]
-
-
-def has_place(name: str) -> bool:
-    """Return whether an effect has a place where it alone acts: a rest, for creep and drift."""
-    return _PLACES.get(name) is _at_rest
-
-
-def follows_motion(name: str) -> bool:
-    """Return whether an effect shows within single motions: a gain that drifts."""
-    return _PLACES.get(name) is _in_motion
 
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
@@ -71,14 +61,14 @@ def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
         products += np.bincount(rows.block[part], one * e, products.size)
         sizes += np.bincount(rows.block[part], one * one, sizes.size)
     size = float(sizes.sum())
-    if size <= criteria.STANDARD_ERRORS**2 * noise or size == 0.0:
+    if size <= STANDARD_ERRORS**2 * noise or size == 0.0:
         return False
     kappa = 1.0 + float(products.sum()) / size
     # each block is one observation
     spread = products - (kappa - 1.0) * sizes
     error = float(np.sqrt(spread @ spread)) / size
-    low, high = criteria.SHOWS
-    return low <= kappa <= high and kappa > criteria.STANDARD_ERRORS * error
+    low, high = SHOWS
+    return low <= kappa <= high and kappa > STANDARD_ERRORS * error
 
 
 def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:

@@ -28,7 +28,6 @@ from piezo_ident.diagnosis.retuning import (
     BEYOND,
     retuned,
     retuning_factor,
-    retuning_squares,
     retuning_terms,
 )
 from piezo_ident.diagnosis.rows import Rows
@@ -111,16 +110,6 @@ class Simulator:
         G, delay = self.model.dynamics, self.model.total_delay
         lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
         return self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
-
-    @functools.cached_property
-    def retuning_squares(self) -> Array:
-        """See `retuning.retuning_squares`."""
-        return retuning_squares(self.model.dynamics, self.model.sample_rate, self._band)
-
-    def holds_retuning(self, state: State) -> bool:
-        """Return whether one filter can stand for G and its factor."""
-        G, rate = self.model.dynamics, self.model.sample_rate
-        return not any(state.retuning) or retuned(G, state.retuning, rate, self._band) is not G
 
     def base_columns(self, law: HysteresisLaw) -> Array:
         """

@@ -23,6 +23,8 @@ CREEP = 'creep'
 DRIFT = 'thermal_drift'
 #: effect that is a gain which changes with time
 WANDERS = 'gain_drift'
+#: effects that have a test of their own, by lines and by coherence with a further channel
+TESTED = ('periodic_disturbance', 'cross_coupling')
 
 
 @dataclass(frozen=True, eq=False)

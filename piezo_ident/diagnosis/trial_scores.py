@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.diagnosis.criteria import ON_AMPLITUDE
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     normal_equations,
@@ -30,6 +29,9 @@ from piezo_ident.diagnosis.state import Added
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
+
+#: range of the amplitude that an effect which is either on or off gets in a fit; 1 is exact
+ON_AMPLITUDE = (0.2, 3.0)
 
 #: called with the share of the work that is done; may raise `Cancelled`
 Tick = Callable[[float], None]

@@ -284,6 +284,20 @@ class Hysteresis:
             bias=None if self.bias is None else self.bias[alive],
         )
 
+    def scaled(self, gain: float) -> Hysteresis:
+        """Return H times a gain, which must not be negative."""
+        lags = self.relaxations
+        return replace(
+            self,
+            weights=gain * self.weights,
+            p0=gain * self.p0,
+            p1=gain * self.p1,
+            p2=gain * self.p2,
+            curves=None if self.curves is None else gain * self.curves,
+            bias=None if self.bias is None else gain * self.bias,
+            relaxations=None if lags is None else lags * np.array([1.0, gain, gain, gain]),
+        )
+
     @property
     def numbers(self) -> Array:
         """All parameters in a row: r, q, p0, p1, p2, curves, bias."""

@@ -168,7 +168,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         ('verdict', result.verdict.replace('_', ' ')),
         ('model', ', '.join(result.changes) or 'stays as given'),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
-        (_kept(result), ', '.join(e.name for e in result.effects) or 'nothing'),
+        ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
 
@@ -201,8 +201,9 @@ def _stands_for(result: Diagnosis) -> str:
 
 
 def _left(result: Diagnosis, part: FoundEffect | Unexplained) -> str:
-    of = 'what a refit of the hysteresis takes' if result.is_of_refit else 'the explainable part'
-    return f'{share_text(part.share)} of {of}, {number(part.rms_percent)} % of stroke'
+    return (
+        f'{share_text(part.share)} of the explainable part, {number(part.rms_percent)} % of stroke'
+    )
 
 
 def ways_of(result: Diagnosis) -> tuple[Way, ...]:
@@ -247,16 +248,12 @@ def reversal_text(result: Diagnosis, found: Sequence[Way]) -> str:
     if result.effects and not result.changes:
         return text.rstrip()
     names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
-    if result.is_of_refit:
-        # a refit does the same
-        text += f'{share_text(1.0 - (refined / given) ** 2)} of its square go with {names}'
-    else:
-        text += (
-            f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
-            'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
-        )
-        if result.effects and refined < refitted:
-            text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
+    text += (
+        f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
+        'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
+    )
+    if result.effects and refined < refitted:
+        text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
     last, there = (refined, elsewhere[2]) if result.effects else (refitted, elsewhere[1])
     return f'{text}. {number(last)} % stay, elsewhere {number(there)} %.'
 
@@ -265,11 +262,6 @@ def _rms(some: Sequence[Way]) -> tuple[float, ...]:
     n = np.array([w.n for w in some])
     squares = np.array([w.rms for w in some]) ** 2
     return tuple(float(x) for x in np.sqrt(n @ squares / n.sum()))
-
-
-def _kept(result: Diagnosis) -> str:
-    """Return whether the effects found are in the refined model."""
-    return 'found, not added' if result.effects and not result.changes else 'added'
 
 
 def _added(result: Diagnosis) -> list[str]:
@@ -293,10 +285,8 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     title, n = 'Candidates that were not added', len(rows)
     if most is not None and n > most:
         title, rows = f'{title}, the first {most} of {n}', rows[:most]
-    of = 'a refit of the hysteresis takes' if result.is_of_refit else 'a sum of plays leaves'
     note = (
-        'Share of the explainable part of the residual that each explains when it is added alone; '
-        f'for effects that follow the path of the voltage alone, of what {of}.'
+        'Share that each takes, added alone, of what the hysteresis that fits best leaves without.'
     )
     return table(title, ('effect', 'share', 'why not'), rows, note)
 
@@ -377,7 +367,7 @@ def diagnosis_text(result: Diagnosis) -> str:
             *unseen_tables(result),
             reversal_text(result, ways_of(result)),
             Table('', ('', ''), [*facts(result)[:2], *remains(result)]),
-            *(f'{_kept(result)}: {text}' for text in _added(result)),
+            *(f'added: {text}' for text in _added(result)),
             *_parameter_tables(result),
             f'these data cannot tell apart: {"; ".join(alike)}' if alike else '',
             *_candidate_tables(result, CANDIDATES),

@@ -209,7 +209,7 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
         'smallest_detectable': {'percent_of_stroke': result.smallest_detectable},
         'hysteresis': {'law': result.law, 'errors_of_laws': dict(result.errors_of_laws)},
-        'shares_are_of_refit': result.is_of_refit,
+        'set_in': result.set_in,
         'held_out_kinds': list(result.kinds),
         'share_outside_range': result.outside,
         'untestable': [asdict(x) for x in result.untestable],

@@ -48,7 +48,16 @@ def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
         if at.size:
             edges = np.flatnonzero(np.diff(s.block[at])) + 1
             for part in np.split(at, edges):
-                described[s.block[part[0]]] = _description(s.u[part[0] : part[-1] + 1])
+                described[s.block[part[0]]] = description(s.u[part[0] : part[-1] + 1])
+    return kinds_of(described)
+
+
+def kinds_of(described: Array) -> Integers | None:
+    """
+    Return the kind of each block by its description, shape (blocks,), -1 for none.
+
+    The description has shape (blocks, k), nan of a block without one.  None as of `motion_kinds`.
+    """
     known = np.flatnonzero(np.isfinite(described).all(axis=1))
     if known.size < 2 * KINDS:
         return None
@@ -59,13 +68,13 @@ def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
     inside = [k for k in range(KINDS) if (label == k).any() and not _is_edge(x, label == k)]
     if len(inside) < FEWEST:
         return None
-    kinds = np.full(count, -1)
-    for place, k in zip(known, label, strict=True):
-        kinds[place] = k if k in inside else -1
+    kinds = np.full(described.shape[0], -1)
+    kinds[known] = np.where(np.isin(label, inside), label, -1)
     return kinds
 
 
-def _description(u: Array) -> Array:
+def description(u: Array) -> Array:
+    """Return the mean, and logarithms of the size and the speed, of a voltage; shape (3,)."""
     speed = float(np.sqrt(np.mean(np.diff(u) ** 2))) if u.size > 1 else 0.0
     return np.array([u.mean(), np.log(float(u.std()) + FAINT), np.log(speed + FAINT)])
 

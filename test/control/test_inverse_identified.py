@@ -70,7 +70,9 @@ def test_an_identified_model_brings_the_stage_where_it_is_told(name, request):
     # from where nothing has crept yet
     wanted = 2e-6 + 25e-6 * soft * (1.0 - np.cos(2 * np.pi * 30 * t))
     drive = pi.invert(model, wanted)
-    assert drive.error < 0.01 and not drive.warnings
+    assert drive.error < 0.01
+    # a model that knows creep tells what is left of it
+    assert all(name == 'refined' and 'creeps' in warning for warning in drive.warnings)
     assert 0.0 < drive.expected < 1.0
     y = TRUTH.simulate(drive.v)[drive.lead :]
     error = 100.0 * np.sqrt(np.mean((y - wanted) ** 2)) / np.ptp(wanted)

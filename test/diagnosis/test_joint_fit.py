@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
-from piezo_ident.diagnosis.base_refit import base_thresholds
 from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, Scale
 from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly
+from piezo_ident.diagnosis.refits import base_thresholds
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.starts import fit_starts

@@ -41,7 +41,7 @@ def test_rows_count_once_the_voltage_has_swept_most_of_its_range():
     assert missed(rows) < 1e-6 < 0.005 < missed(as_at_rest)
 
 
-def test_parts_of_what_is_judged_stand_for_kinds_where_most_of_a_record_rests():
+def test_no_kind_holds_most_of_what_is_judged_where_most_of_a_record_rests():
     model = SimulatedStage.load('paper').model
     t = np.arange(FS) / FS
     # six seconds of rest in the middle of the range, of which the memory is not known
@@ -49,6 +49,5 @@ def test_parts_of_what_is_judged_stand_for_kinds_where_most_of_a_record_rests():
     y = model.simulate(np.concatenate([np.linspace(0, 8, FS), np.linspace(8, 5, FS), v]))
     rows = make_rows(model, [Record.from_arrays(v, y[2 * FS :], sample_rate=FS, name='late')])
     assert not rows.kinds
-    assert rows.labels == tuple(f'late, part {i + 1}' for i in range(8))
     counts = np.bincount(rows.group[rows.block])
-    assert counts.min() > 0.8 * counts.max()
+    assert counts.size > 3 and counts.max() < 0.4 * counts.sum()

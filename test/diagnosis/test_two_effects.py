@@ -18,5 +18,5 @@ def test_both_are_named():
     assert result.verdict == 'named'
     shares = {effect.name: effect.share for effect in result.effects}
     assert shares.keys() == EFFECTS.keys()
-    assert 0.02 < shares['rate_dependent_hysteresis'] < 0.1
+    assert 0.02 < shares['rate_dependent_hysteresis'] < 0.2
     assert result.after.overall < 0.02 * result.before.overall

@@ -1,0 +1,99 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is held out together: stretches with one label, or blocks whose command moves alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.identification.prepare import Run
+from piezo_ident.selection.motion_kinds import description, interleaved, KINDS, kinds_of
+
+#: whole stretches of one kind that are held out in turn, at most
+GROUPS = 8
+#: name of the kinds that are too small, of a part of what has one kind alone, and of blocks whose
+#: command moves alike
+REST, PART, ALIKE = 'the rest', ', part ', 'motion that is alike'
+
+
+def are_parts(labels: Sequence[str]) -> bool:
+    """Return whether names of kinds are no labels of the user."""
+    return all(x in (REST, ALIKE) or PART in x for x in labels)
+
+
+def stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
+    """Return label, first row and end of the segments of a run; everything belongs to one."""
+    n = run.piece.n // m
+    if not run.piece.segments:
+        # without labels, parts of the time stand for kinds
+        edges = np.linspace(0, n, GROUPS + 1).astype(int)
+        names = [f'{run.record}{PART}{i + 1}' for i in range(GROUPS)]
+        return [
+            (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
+        ]
+    found: list[tuple[str, int, int]] = []
+    end = 0
+    for s in run.piece.segments:
+        start, stop = max(end, s.start // m), min(n, s.stop // m)
+        if start > end:
+            found.append(('ramp', end, start))
+        if stop > start:
+            found.append((s.label, start, stop))
+            end = stop
+    if end < n:
+        found.append(('ramp', end, n))
+    return found
+
+
+def held_out_kinds(
+    labels: Sequence[str], commands: Sequence[Array]
+) -> tuple[Integers, tuple[str, ...]]:
+    """
+    Return which blocks make a kind of motion, shape (blocks,), and the names of the kinds.
+
+    `labels` are those of the blocks, and `commands` their rows.  The smallest kinds are put
+    together.  Where labels name fewer than two kinds, mean, size and speed of the command tell
+    them, and where that tells too few, parts of the time stand for them.
+    """
+    sizes = [u.size for u in commands]
+    size: dict[str, int] = {}
+    for label, n in zip(labels, sizes, strict=True):
+        size[label] = size.get(label, 0) + int(n)
+    large = sorted(size, key=lambda label: -size[label])
+    large = [label for label in large if label.partition(':')[0] not in ('idle', 'ramp')]
+    names = large if len(large) < GROUPS else large[: GROUPS - 1]
+    number = {label: i for i, label in enumerate(names)}
+    rest = len(names)
+    group = np.array([number.get(label, rest) for label in labels])
+    if np.any(group == rest):
+        names = [*names, REST]
+    few = all(PART in name for name in names) and len(names) < GROUPS // 2
+    if all(PART in name or name == REST for name in names) or len(names) == 1:
+        found = _by_command(commands)
+        if found is not None:
+            return found
+    if len(names) == 1 or few:
+        # of one kind, or where most of a record is not judged, nothing would be left to predict
+        # from: parts of what is judged stand for kinds
+        whole = ' and '.join(dict.fromkeys(name.partition(PART)[0] for name in names))
+        group = np.arange(group.size) * GROUPS // group.size
+        names = [f'{whole}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
+    return group, tuple(names)
+
+
+def _by_command(commands: Sequence[Array]) -> tuple[Integers, tuple[str, ...]] | None:
+    """
+    Return kinds by what the command of each block does, None where they are too few.
+
+    A kind at the edge of place, size or speed would have to be extrapolated: its blocks are held
+    out in spread sets.
+    """
+    kinds = kinds_of(np.array([description(u) for u in commands]))
+    if kinds is None:
+        return None
+    spread = KINDS + interleaved(kinds.size)
+    group = np.unique(np.where(kinds < 0, spread, kinds), return_inverse=True)[1]
+    return group, (ALIKE,) * (int(group.max()) + 1)

@@ -1,0 +1,205 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Refits of H, and the walk to the H of the refined model.
+
+Blocks held out between fitted ones must not choose H: a wide H with a retuned G may leave little
+of them and err widely under other motion.  So the walk begins at the H as it was given, and takes
+a step towards a wider one only where of whole kinds of motion most of the error goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
+from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
+from piezo_ident.diagnosis.decision import Candidate, Candidates
+from piezo_ident.diagnosis.fit_steps import BaseColumns
+from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.retuning import RETUNING
+from piezo_ident.diagnosis.rows import means
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.toward_given import toward_given
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
+
+#: laws of H that are wider than plays: with loops that are not congruent, and with lags, too
+WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """
+    One H of the walk.
+
+    Attributes
+    ----------
+    way : {'given', 'gain', 'plays', 'drawn', 'wide'}
+        As it was given, with another gain, refitted as plays, wide and drawn to the given one, or
+        wide.
+    fitted : Fitted
+    gain : float
+        Gain over that of the given H, where that alone has changed.
+    """
+
+    way: str
+    fitted: Fitted
+    gain: float = 1.0
+
+
+def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
+    """
+    Return H refitted as plays on a fine grid, and as the wider law that leaves less.
+
+    A voltage that never moves raises IdentificationError.
+    """
+    if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
+        raise IdentificationError('the voltage never moves; record the stage while it is driven')
+    plays, *wide = (refit_of(simulator, given, name) for name in ('plays', *WIDE))
+    return plays, min(wide, key=lambda fit: float(fit.errors.sum() * fit.transfer.sum()))
+
+
+def base_thresholds(swing: float) -> np.ndarray:
+    """Return nineteen even thresholds over the swing, and four fine ones near zero."""
+    fine = np.array([0.005, 0.012, 0.025, 0.037])
+    return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
+
+
+def refit_of(simulator: Simulator, state: State, name: LawName) -> Fitted:
+    """Return H refitted as one of a family, effects and G as they are."""
+    low, high = simulator.rows.reach
+    swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
+    law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
+    return fit_jointly(simulator, *fit_base(simulator, state, law))
+
+
+def with_g(simulator: Simulator, fitted: Fitted) -> Fitted:
+    """Return a fit with G retuned, too."""
+    state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
+    return fit_jointly(simulator, state, fitted.base)
+
+
+def walk(
+    simulator: Simulator,
+    given: State,
+    candidates: Candidates,
+    best: Candidate | None,
+    tick: Callable[[], None],
+) -> Step:
+    """Return the H of the refined model, beside the effects of the best candidate."""
+    steps = _steps(simulator, given, candidates, best, tick)
+    first = last = next(steps)
+    if candidates.rows.passes < PASSES:
+        # a branch that was passed once has no second one to be held out
+        return first
+    for step in steps:
+        tick()
+        if _left(candidates, step.fitted) <= TAKES * _left(candidates, last.fitted):
+            last = step
+    if best is not None:
+        return last
+    # a gain is one number
+    gain = _other_gain(simulator, first.fitted)
+    known, left = (_left(candidates, x.fitted) for x in (first, last))
+    is_gain = gain.gain > 0.0 and _left(candidates, gain.fitted) <= min(
+        TAKES * known, ALIKE * left
+    )
+    return gain if is_gain else last
+
+
+def _left(candidates: Candidates, fitted: Fitted) -> float:
+    """Return what a fit leaves of whole kinds of motion beyond the noise, a mean square."""
+    error = float(fitted.transfer.sum()) / candidates.rows.n
+    return max(error - candidates.noise, 0.0) + candidates.least_share
+
+
+def _steps(
+    simulator: Simulator,
+    given: State,
+    candidates: Candidates,
+    best: Candidate | None,
+    tick: Callable[[], None],
+) -> Iterator[Step]:
+    """Give one H after the other, each wider than the one before."""
+    own = candidates.of(()) if best is None else (best,)
+    known = {c.way: c.fitted for c in own if not c.retunes}
+    retuned = {c.way: c.fitted for c in own if c.retunes}
+    state = next(c for c in candidates.all if c.way == 'given').fitted.state
+    if best is not None:
+        found = best.fitted.state
+        state = replace(state, effects=found.effects, fading=found.fading, earlier=found.earlier)
+    first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
+    yield Step('given', first)
+    yield Step('plays', known.get('plays') or refit_of(simulator, first.state, 'plays'))
+    yield from (Step(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
+    of_law = {law_of(known['wide']): known['wide']} if 'wide' in known else {}
+
+    def wide_of(name: LawName) -> Fitted:
+        if name not in of_law:
+            of_law[name] = refit_of(simulator, first.state, name)
+        return of_law[name]
+
+    laws = WIDE
+    if not simulator.rows.kinds:
+        # kinds of motion told apart by the voltage alone do not hold lags along the path, unless
+        # the given H, which came from other motion, holds them back
+        wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
+        drawn = toward_given(simulator, given, wide, tick)
+        if drawn is not wide:
+            yield Step('drawn', drawn)
+        laws = WIDE[:1]
+    wides = [wide_of(name) for name in laws]
+    yield from (Step('wide', wide) for wide in wides)
+    # a change of G that was found is all that there is of it
+    wide = min(wides, key=partial(_left, candidates))
+    changes_g = any(added.effect.in_dynamics for added in wide.state.effects)
+    if simulator.is_fast and not changes_g:
+        known_g = retuned.get('wide')
+        if known_g is None or law_of(known_g) != law_of(wide):
+            known_g = with_g(simulator, wide)
+        yield Step('wide', known_g)
+
+
+def law_of(fitted: Fitted) -> LawName:
+    """Return the law of a refitted H; 'any' of an H that stays as it is."""
+    return 'any' if fitted.state.law is None else fitted.state.law.name
+
+
+def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
+    """Return a fit whose H is the same with another gain."""
+    rows, state = simulator.rows, fitted.state
+    x = simulator.bare(state)
+    x = x - x.mean()
+    columns = np.concatenate([x[None], simulator.added_columns(state).T]).T
+    base = BaseColumns.of(rows, columns)
+    free, none = np.ones(columns.shape[1], bool), np.zeros(columns.shape[1])
+    equations = normal_equations(rows, columns, fitted.e[:, None])
+    theta = np.linalg.lstsq(equations.A.sum(axis=0), equations.b.sum(axis=0)[:, 0], rcond=None)[0]
+    gain = 1.0 + float(theta[0])
+    e = fitted.e - columns @ theta
+    moved = replace(state, hysteresis=state.hysteresis.scaled(max(gain, 0.0)))
+    moved = replace(
+        moved, offsets=moved.offsets + means(rows.x - e - simulator.run(moved), rows.of_record)
+    )
+    errors, transfer = (
+        held_out_errors(equations, sets, none)[:, 0] for sets in (rows.fold, rows.group)
+    )
+    step = replace(
+        fitted,
+        state=moved,
+        base=base,
+        e=e,
+        moving=np.empty((rows.n, 0)),
+        free=free,
+        parameters=(),
+        prior=none,
+        errors=errors,
+        transfer=transfer,
+    )
+    return Step('gain', step, gain)
