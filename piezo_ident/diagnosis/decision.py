@@ -32,6 +32,7 @@ import numpy as np
 from piezo_ident.diagnosis.criteria import (
     ALIKE,
     BEYOND_CHANCE,
+    LITTLE,
     NOISE_SHARE,
     PASSES,
     RIVALS,
@@ -125,6 +126,10 @@ class Candidates:
     def percent(self, left: float) -> float:
         """Return what is left as rms in % of stroke."""
         return self.rows.percent(left - self.least_share)
+
+    def is_part(self, left: float, whole: float) -> bool:
+        """Return whether what is left of a whole is more than little, and could be an effect."""
+        return left > LITTLE * whole and self.percent(left) >= SMALLEST_EFFECT
 
     def of(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> tuple[Candidate, ...]:
         """
@@ -291,8 +296,16 @@ def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
 
 
 def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of the size of the best one that leave hardly more, the best first."""
-    most = RIVALS * candidates.left(best)
+    """
+    Return the sets of the size of the best one that are not separated from it, the best first.
+
+    They leave hardly more.  Where the best one explains a part alone, the rest may be of any law:
+    then a set that takes most of what the best one takes is one of them, too.
+    """
+    left, whole = candidates.left(best), candidates.left(candidates.without(best.effects))
+    most = RIVALS * left
+    if candidates.is_part(left, whole):
+        most = max(most, left + TAKES * (whole - left))
     found = []
     for other in candidates.sets:
         if len(other) != len(best.effects) or other == best.effects:

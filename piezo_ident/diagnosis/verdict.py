@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.diagnosis.criteria import (
     CLASS_SIZE,
-    LITTLE,
     PASSES,
     SMALLEST_EFFECT,
     SWALLOWED,
@@ -107,8 +106,7 @@ def judge(
         effects = (*shown, *_in_order(decision))
         group = _class(decision.names, untried, effects)
         verdict = 'class' if group else 'named'
-        # a rest that is smaller than any effect is no part that lacks one
-        if share < 1.0 - LITTLE and candidates.percent(rest) >= SMALLEST_EFFECT:
+        if candidates.is_part(rest, whole):
             verdict = 'partly_explained'
         gains += [] if best is None else _gains(candidates, best, effects, whole)
         # H as refitted beside them takes a part, too

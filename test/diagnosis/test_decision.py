@@ -184,3 +184,13 @@ def test_without_labels_nothing_is_said_to_have_set_in(given):
 def test_others_that_have_set_in_are_rivals(given):
     some = [beside_given('backlash', 0.8 * WHOLE), beside_given('saturation', 1.2 * WHOLE)]
     assert decide(given.and_these(some)).names == ('backlash', 'saturation')
+
+
+@pytest.mark.parametrize(('left', 'is_class'), [(0.2, True), (0.01, False)])
+def test_what_takes_most_of_a_part_is_not_told_from_it(given, left, is_class):
+    # the one leaves a part, or little; the other takes three quarters of what the one takes
+    one, other = left * WHOLE, (1.0 - 0.75 * (1.0 - left)) * WHOLE
+    both = given.and_these([found('creep', left=one), found('gain_drift', left=other)])
+    decision = decide(both)
+    assert decision.best.effects == ('creep',)
+    assert decision.rivals == ((('gain_drift',),) if is_class else ())
