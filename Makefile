@@ -24,9 +24,12 @@ demo: .venv/.demo
 	.venv/bin/python examples/demo.py --out demo_report
 
 # the tests that mostly compute, with mypy beside them, those of node processes, then, one after the
-# other, what loads the machine and what judges seconds; a file stays in one process, the slowest
-# file starts first; what another program's burst made fail is asked once more, alone
-PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder -m 'not timed and not loads'
+# other, what loads the machine and what judges seconds; the slowest files start first.  A file of
+# the first stays in one process.  The middleware may end a process of the second, and only
+# `worksteal` goes on then: `loadfile` waits for ever.  What another program's burst made fail is
+# asked once more, alone
+PARALLEL := -n 2 -m 'not timed and not loads'
+FILES := --dist loadfile --no-loadscope-reorder
 ALONE := -m 'timed or loads' test/nodes
 AGAIN := --last-failed --last-failed-no-failures none
 
@@ -34,8 +37,8 @@ test: .venv/.test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy & types=$$!; \
-	.venv/bin/pytest $(PARALLEL) --ignore=test/nodes $(PYTEST_ARGS); rc=$$?; wait $$types && exit $$rc
-	.venv/bin/pytest $(PARALLEL) test/nodes $(PYTEST_ARGS) || \
+	.venv/bin/pytest $(PARALLEL) $(FILES) --ignore=test/nodes $(PYTEST_ARGS); rc=$$?; wait $$types && exit $$rc
+	.venv/bin/pytest $(PARALLEL) --dist worksteal test/nodes $(PYTEST_ARGS) || \
 	.venv/bin/pytest $(AGAIN) -m 'not timed and not loads' test/nodes $(PYTEST_ARGS)
 	.venv/bin/pytest $(ALONE) $(PYTEST_ARGS) || .venv/bin/pytest $(AGAIN) $(ALONE) $(PYTEST_ARGS)
 
