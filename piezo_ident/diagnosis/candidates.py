@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import ALIKE, LITTLE, RIVALS, SMALLEST_EFFECT, TAKES
-from piezo_ident.diagnosis.decision import Candidate, Candidates
+from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.refits import law_of, refit_of, with_g
@@ -120,14 +120,7 @@ class CandidateSearch:
         for effects in sets[:IN_ALL_WAYS]:
             best = candidates.of(effects)[0]
             have = {c.way for c in candidates.of(effects)}
-            given = next(c for c in candidates.of(()) if c.way == 'given' and not c.retunes)
-            found = best.fitted.state
-            state = replace(
-                given.fitted.state,
-                effects=found.effects,
-                fading=found.fading,
-                earlier=found.earlier,
-            )
+            state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
             more = []
             if 'given' not in have:
                 fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
@@ -138,7 +131,7 @@ class CandidateSearch:
                 if way not in have:
                     fitted = refit_of(self._simulator, state, law)
                     more.append(replace(best, way=way, fitted=fitted))
-            if self._simulator.is_fast and not _changes_g(effects):
+            if self._simulator.is_fast and not change_g(effects):
                 last = min(more, key=candidates.left, default=best)
                 if not last.retunes:
                     more.append(replace(last, fitted=with_g(self._simulator, last.fitted)))
@@ -152,7 +145,8 @@ class CandidateSearch:
         given = fit_jointly(simulator, state, base_at(simulator, state))
         if plays.state.effects != wide.state.effects:
             plays = refit_of(simulator, state, 'plays')
-        found = [Candidate((), way, f) for way, f in _named(given, plays, wide)]
+        named = {'given': given, 'plays': plays, 'wide': wide}
+        found = [Candidate((), way, fitted) for way, fitted in named.items()]
         if simulator.is_fast:
             found += [replace(found[i], fitted=with_g(simulator, found[i].fitted)) for i in (0, 2)]
         return Candidates(simulator.rows, self._noise, self._missed, tuple(found))
@@ -212,14 +206,6 @@ class CandidateSearch:
         )
 
 
-def _changes_g(effects: Sequence[str]) -> bool:
-    return any(find_effect(name).in_dynamics for name in effects)
-
-
-def _named(given: Fitted, plays: Fitted, wide: Fitted) -> tuple[tuple[str, Fitted], ...]:
-    return ('given', given), ('plays', plays), ('wide', wide)
-
-
 def _best_h(candidates: Candidates) -> Candidate:
     """Return the H that leaves least with the G as it is."""
     return min((c for c in candidates.all if not c.retunes), key=candidates.left)
@@ -232,7 +218,6 @@ def _worth_searching(candidates: Candidates) -> list[Candidate]:
     That with a retuned G, too, where it leaves clearly less.
     """
     best = _best_h(candidates)
-    given = [c for c in candidates.all if c.way == 'given' and not c.retunes]
     retuned = sorted((c for c in candidates.all if c.retunes), key=candidates.left)
     more = [c for c in retuned if ALIKE * candidates.left(c) <= candidates.left(best)]
-    return [*dict.fromkeys((*given, best)), *more[:1]]
+    return [*dict.fromkeys((candidates.as_given, best)), *more[:1]]

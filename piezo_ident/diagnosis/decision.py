@@ -117,11 +117,15 @@ class Candidates:
     def left_by(self, fitted: Fitted) -> float:
         """Return what a fit leaves beyond the noise, a mean square."""
         error = np.sqrt(fitted.errors.sum() * fitted.transfer.sum()) / self.rows.n
-        return float(max(error - self.noise, 0.0) + self.least_share)
+        return self.beyond_noise(float(error))
+
+    def beyond_noise(self, square: float) -> float:
+        """Return a mean square without the noise, but for a share of it."""
+        return max(square - self.noise, 0.0) + self.least_share
 
     def _of_blocks(self, candidate: Candidate) -> float:
-        """Return the same of blocks held out in spread sets alone."""
-        return max(candidate.fitted.mean_square - self.noise, 0.0) + self.least_share
+        """Return what is left of blocks held out in spread sets alone."""
+        return self.beyond_noise(candidate.fitted.mean_square)
 
     def percent(self, left: float) -> float:
         """Return what is left as rms in % of stroke."""
@@ -138,7 +142,7 @@ class Candidates:
         Beside a set that changes G a retuned G is a change, too, and does not count.
         """
         some = [c for c in self.all if c.effects == effects]
-        if _change_g(beside) or _change_g(effects):
+        if change_g(beside) or change_g(effects):
             some = [c for c in some if not c.retunes]
         return tuple(sorted(some, key=self.left))
 
@@ -173,14 +177,14 @@ class Candidates:
             if other is None:
                 continue
             before, most = self.left(other), TAKES ** (len(effects) - len(part))
-            if not _change_g(effects):
+            if not change_g(effects):
                 before = min(before, self._missed_by_g(part))
             if left > most * before:
                 return False
             # beside another effect it must not be kinds of motion alone that speak for it
             if part and self._of_blocks(best) > most * self._of_blocks(other):
                 return False
-            changes = _change_g(tuple(set(effects) - set(part)))
+            changes = change_g(tuple(set(effects) - set(part)))
             if changes and self.rows.percent(before - left) < self.missed:
                 return False
         return _beyond_chance(best)
@@ -188,7 +192,7 @@ class Candidates:
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
         """Return what is left with a changed G that takes no more than G missed before."""
         before, found = self.best(part), math.inf
-        for name in (name for name in self._names if _change_g([name])):
+        for name in (name for name in self._names if change_g([name])):
             other = self.best(tuple(sorted((*part, name))))
             if before is None or other is None:
                 continue
@@ -205,10 +209,15 @@ class Candidates:
         return min(self.left(c) for c in self.of((), effects) if c.way == 'given')
 
     @property
+    def as_given(self) -> Candidate:
+        """The model as it was given."""
+        found = (c for c in self.of(()) if c.way == 'given' and not c.retunes)
+        return next(found)
+
+    @property
     def given(self) -> float:
         """What the model leaves as it was given."""
-        found = [c for c in self.all if (c.way, c.effects, c.retunes) == ('given', (), False)]
-        return self.left(found[0])
+        return self.left(self.as_given)
 
     def like_refit(self) -> tuple[Candidate, ...]:
         """
@@ -316,7 +325,8 @@ def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...],
     return tuple(found)
 
 
-def _change_g(effects: Sequence[str]) -> bool:
+def change_g(effects: Sequence[str]) -> bool:
+    """Return whether one of some effects changes G."""
     return any(find_effect(name).in_dynamics for name in effects)
 
 

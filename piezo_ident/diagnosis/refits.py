@@ -19,7 +19,7 @@ import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
-from piezo_ident.diagnosis.decision import Candidate, Candidates
+from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.fit_steps import BaseColumns
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.retuning import RETUNING
@@ -115,8 +115,7 @@ def walk(
 
 def _left(candidates: Candidates, fitted: Fitted) -> float:
     """Return what a fit leaves of whole kinds of motion beyond the noise, a mean square."""
-    error = float(fitted.transfer.sum()) / candidates.rows.n
-    return max(error - candidates.noise, 0.0) + candidates.least_share
+    return candidates.beyond_noise(float(fitted.transfer.sum()) / candidates.rows.n)
 
 
 def _steps(
@@ -130,10 +129,9 @@ def _steps(
     own = candidates.of(()) if best is None else (best,)
     known = {c.way: c.fitted for c in own if not c.retunes}
     retuned = {c.way: c.fitted for c in own if c.retunes}
-    state = next(c for c in candidates.all if c.way == 'given').fitted.state
+    state = candidates.as_given.fitted.state
     if best is not None:
-        found = best.fitted.state
-        state = replace(state, effects=found.effects, fading=found.fading, earlier=found.earlier)
+        state = state.with_effects_of(best.fitted.state)
     first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
     yield Step('given', first)
     yield Step('plays', known.get('plays') or refit_of(simulator, first.state, 'plays'))
@@ -158,8 +156,7 @@ def _steps(
     yield from (Step('wide', wide) for wide in wides)
     # a change of G that was found is all that there is of it
     wide = min(wides, key=partial(_left, candidates))
-    changes_g = any(added.effect.in_dynamics for added in wide.state.effects)
-    if simulator.is_fast and not changes_g:
+    if simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
         known_g = retuned.get('wide')
         if known_g is None or law_of(known_g) != law_of(wide):
             known_g = with_g(simulator, wide)

@@ -114,6 +114,10 @@ class State:
         """Return the state without what creeps on from before."""
         return replace(self, fading=(), earlier=np.empty(0))
 
+    def with_effects_of(self, other: State) -> State:
+        """Return the state with the effects of another one, and what creeps on in it."""
+        return replace(self, effects=other.effects, fading=other.fading, earlier=other.earlier)
+
     def with_effect(self, added: Added) -> State:
         """Return the state with one more effect."""
         return replace(self, effects=(*self.effects, added))
