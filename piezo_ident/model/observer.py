@@ -16,9 +16,9 @@ path of the voltage: at rest it stays as it is, and no time averages it out.  A 
 follows o, d and m by the means of groups of samples.  `estimate` is the free run plus offset and
 creep; m is no part of it, since what the model lacks must show.
 
-On request the gain is followed, too: g x more, of the free run x about the zero of the model, where
-g walks at random.  Only motion tells a gain from an offset.  What time adds to the variance of g
-therefore waits until the voltage moves, and is freed along its path; at rest g stays as it is.  A
+On request the gain is followed, too: g x more, of the free run x about the zero of the
+model, where g walks at random.  Only motion tells a gain from an offset.  What time adds to its
+variance waits until the voltage moves, and is freed along the path; at rest g stays as it is.  A
 step of the gain is refused first, as any step is.  It is followed as soon as the voltage has moved
 and what was refused goes with x.
 
@@ -70,7 +70,7 @@ ZEROS = (1e-3, 1.0)
 #: rms change of the gain in a second: d33 of PZT changes by some 0.1 % a kelvin, and a stage that
 #: warms as it works by a kelvin in a minute
 GAIN_WALK = 1e-3 / np.sqrt(60.0)
-#: rms size of its change since identification (taste: ten kelvin and a half-depoled stack are 10 %)
+#: rms size of its change since identification (taste: some ten kelvin and lost poling)
 GAIN_SIZE = 0.1
 #: measurements in a row that make a step, and their spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
@@ -199,7 +199,9 @@ class Observer:
         reach2 = law.numbers[kernel.REACH]
         P = np.zeros((count, n, n))
         for b, zero in enumerate(self._zeros):
-            P[b] = np.diag([zero**2, *[reach2] * c, *[0.0] * (n - 2 - c), law.numbers[kernel.ERROR]])
+            P[b] = np.diag(
+                [zero**2, *[reach2] * c, *[0.0] * (n - 2 - c), law.numbers[kernel.ERROR]]
+            )
         now = np.zeros(kernel.PLACES)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
         now[kernel.IDLE] = self._gain * law.numbers[kernel.GAIN_SIZE]

@@ -22,14 +22,17 @@ JUMP = 9.0
 EXPLAINED = 0.1
 #: size of a change of the gain that is no fault of the sensor, in rms sizes (taste)
 LIKELY = 3.0
+#: path over which it is seen on what strokes a gain stands, in lengths of the error (taste)
+STROKES = 10.0
 
 # places of the numbers that `State.now` holds
 COUNT, PATH, BAND, MOVED, SPREAD, SCALE, REFUSED, SCORES, READING, BEGAN = range(10)
 OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
-# and with a gain: mean free run of the group, variance of the gain that motion has not freed yet
-FREE, IDLE, GAIN, GAIN_VAR, CROSS = range(16, 21)
+# and with a gain: mean free run of the group, variance of the gain that motion has not freed yet,
+# and mean and variance of the free run over the last few strokes
+FREE, IDLE, GAIN, GAIN_VAR, CROSS, MEAN_X, VAR_X = range(16, 23)
 # sums over measurements that were refused, of their innovations e and of the free run x
-SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE, PLACES = range(21, 28)
+SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE, PLACES = range(23, 30)
 # places of the numbers that `Law.numbers` holds
 NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE = range(10)
 
@@ -98,6 +101,10 @@ def _let_time_pass(law: Law, s: State) -> None:
         s.P[b, n - 1, n - 1] += now[SCALE] * numbers[ERROR] * (1.0 - phi * phi)
     if _has_gain(law, s):
         # time makes the gain less sure, but a reading tells of that only along a path
+        share = 1.0 - phi ** (1.0 / STROKES)
+        d = now[FREE] - now[MEAN_X]
+        now[MEAN_X] += share * d
+        now[VAR_X] = (1.0 - share) * (now[VAR_X] + share * d * d)
         idle = min(now[IDLE] + numbers[GAIN_WALK], numbers[GAIN_SIZE])
         now[IDLE] = idle * phi * phi
         for b in range(hypotheses):
@@ -155,7 +162,7 @@ def _is_gain(law: Law, now: Array) -> bool:
     by_gain = now[SUM_EE] - now[SUM_XE] ** 2 / now[SUM_XX]
     by_zero = now[SUM_EE] - now[SUM_E] ** 2 / n
     likely = now[SUM_XE] ** 2 <= LIKELY**2 * size * now[SUM_XX] ** 2
-    return likely and by_gain <= EXPLAINED * by_zero
+    return bool(likely and by_gain <= EXPLAINED * by_zero)
 
 
 @ordered_kernel
@@ -257,10 +264,24 @@ def tell(law: Law, s: State) -> None:
 
 
 @ordered_kernel
+def _gain_std(law: Law, s: State) -> float:
+    # a motion that repeats repeats the error of the model, whose slope no time averages out: each
+    # of the two branches has a value a twice its length
+    if not _has_gain(law, s):
+        return 0.0
+    now, size = s.now, law.numbers[GAIN_SIZE]
+    values = max(1.0, np.sqrt(12.0 * now[VAR_X]) / law.numbers[LENGTH])
+    slope = now[SCALE] * law.numbers[ERROR] / (values * max(now[VAR_X], 1e-12))
+    return float(np.sqrt(min(now[GAIN_VAR] + now[IDLE] + slope, size)))
+
+
+@ordered_kernel
 def _end_group(law: Law, s: State) -> None:
     now = s.now
     _let_time_pass(law, s)
-    mean, now[FREE], count = _typical(s.group, np.sqrt(law.numbers[NOISE]))
+    mean, free, count = _typical(s.group, np.sqrt(law.numbers[NOISE]))
+    if count > 0:
+        now[FREE] = free
     if _has_gain(law, s):
         s.row[-2] = now[FREE]
     enough = 2 * count >= s.group.shape[1]
@@ -279,6 +300,7 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
     gain, with the standard deviation behind each.
     """
     now, size = s.now, s.group.shape[1]
+    gain_std = _gain_std(law, s)
     for k in range(y.size):
         then, x = before[0, k], free[k]
         creep = 0.0
@@ -296,6 +318,7 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
                 s.coming[i] *= law.left[i]
             if now[COUNT] == size:
                 _end_group(law, s)
+                gain_std = _gain_std(law, s)
                 now[COUNT] = 0.0
             for i in range(law.left.size):
                 creep += s.coming[i]
@@ -304,4 +327,4 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
         out[1, k] = np.sqrt(max(whole, 0.0))
         out[2, k], out[3, k] = now[OFFSET], np.sqrt(now[OFFSET_VAR])
         out[4, k], out[5, k] = creep, np.sqrt(now[CREEP_VAR])
-        out[6, k], out[7, k] = now[GAIN], np.sqrt(now[GAIN_VAR] + now[IDLE])
+        out[6, k], out[7, k] = now[GAIN], gain_std

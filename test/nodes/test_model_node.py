@@ -314,6 +314,53 @@ def test_a_constant_error_is_said_and_wild_readings_are_left_out(fast):
     assert float(d['residual_mean']) == pytest.approx(0.5e-2 * 75e-6, rel=1e-3)
 
 
+def test_a_gain_that_changed_is_told_by_size_and_corrected_on_request(fast):
+    text = paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}})
+    y = 1.03 * model_of(paper()).stream().process(sine(16_000)[1], np.arange(16_000) / FS)
+    for observed in (False, True):
+        assert fast.set('model', 'observe_gain', observed) == (True, '')
+        reset(fast, text)
+        corrections, since = [], len(fast.diagnoses('model'))
+        subscription = fast.node.create_subscription(
+            JointState, 'corrections', corrections.append, QoSProfile(depth=1000)
+        )
+        judged(fast, blocks(16_000), y)
+
+        def told(observed=observed, since=since):
+            said = [d['message'] for d in fast.diagnoses('model')[since:]]
+            said = [m for m in said if 'gain +3.0' in m]
+            return any(m.startswith('identify again') != observed for m in said)
+
+        fast.wait(told, 'the gain')
+        if observed:
+            d = fast.diagnostics('model')
+            assert float(d['gain/value']) == pytest.approx(0.03, abs=1e-3)
+            assert 'gain/std' in corrections[-1].name
+            assert float(d['estimate_percent']) < 0.01
+        fast.forget(subscription)
+    assert fast.set('model', 'observe_gain', False) == (True, '')
+
+
+def test_a_step_of_the_sensor_is_accepted_at_once(fast):
+    reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}}))
+    y = model_of(paper()).stream().process(sine(24_000)[1], np.arange(24_000) / FS)
+    y[8000:] += 1e-6
+    several, estimate = blocks(24_000), fast.collect('estimate')
+
+    def until(begin, end):
+        before = len(estimate)
+        paired(fast, several[begin:end], y[100 * begin : 100 * end])
+        fast.wait(lambda: len(estimate) >= before + end - begin - 2, 'estimates')
+        return fast.call('model/accept')
+
+    ok, said = until(0, 80)
+    assert not ok and 'no step to accept' in said
+    ok, said = until(80, 120)
+    assert ok and '+1 um' in said
+    until(120, 240)
+    assert np.abs(estimate[-1].values - y[-100:]).max() < 2e-8
+
+
 def paired(g, several, y):
     """Send blocks of voltage, each with the displacement of the same time."""
     for block, part in zip(several, np.split(y, len(several)), strict=True):
