@@ -175,7 +175,7 @@ class Corrector:
             model = self._model
             if model.is_static:
                 model = replace(model, sample_rate=1.0 / period)
-            self._observer = Observer(model, horizon=self._horizon, known=known)
+            self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
         elif kind is Kind.GAP and self._last is not None:
             # as the prediction went on, over a straight line
             share = np.arange(1, missing + 1) / (missing + 1)
