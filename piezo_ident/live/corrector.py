@@ -17,7 +17,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.block_clock import BlockClock
-from piezo_ident.live.monitor import gain_change
 from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.observer import HORIZON, Observed, Observer
@@ -42,8 +41,17 @@ RATE = 50.0
 SETTLED = 1e-5
 #: share of the span from which creep of earlier motion is told
 FAINT = 1e-4
+#: standard deviations from which a change of the gain is told (taste)
+SURE = 3.0
 #: time of the stream for which displacement is waited for [s]
 PATIENCE = 0.5
+
+
+def gain_change(value: float, std: float) -> str:
+    """Return a change of the gain by size; empty where it is not sure."""
+    if not abs(value) > SURE * std > 0.0:
+        return ''
+    return f'gain {100.0 * value:+.1f} +- {max(100.0 * std, 0.05):.1f} %'
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,6 @@ CATCH_UP = 1.0
 MOST = 500
 #: number of bins after which a late quantity is no longer waited for
 LAG = 25
-#: standard deviations from which a change of the gain is told (taste)
-SURE = 3.0
 #: share of the mean square of what is left that goes with the displacement, to tell it as a gain
 #: that is not followed (taste)
 EXPLAINED = 0.5
@@ -264,13 +262,6 @@ class TrackingError:
             errors.append(Samples(pair.t, e, pair.segment, 'tracking_error'))
             self.live.add(pair.t, e, self._high - self._low, pair.y)
         return errors
-
-
-def gain_change(value: float, std: float) -> str:
-    """Return a change of the gain by size; empty where it is not sure."""
-    if not abs(value) > SURE * std > 0.0:
-        return ''
-    return f'gain {100.0 * value:+.1f} +- {max(100.0 * std, 0.05):.1f} %'
 
 
 class LiveError:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.corrector import Corrector, Estimated
-from piezo_ident.live.monitor import gain_change, LiveError, Matched, Matcher, Preview, PreviewBin
+from piezo_ident.live.corrector import Corrector, Estimated, gain_change
+from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel

@@ -5,8 +5,9 @@
 
 import numpy as np
 from piezo_ident.common.errors import ModelError
+from piezo_ident.live.corrector import gain_change
 from piezo_ident.live.history import TurningPoints
-from piezo_ident.live.monitor import gain_change, LiveError, Matcher, Preview, TrackingError
+from piezo_ident.live.monitor import LiveError, Matcher, Preview, TrackingError
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
