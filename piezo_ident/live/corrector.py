@@ -111,9 +111,11 @@ class Corrector:
         self._forget()
 
     @property
-    def observer(self) -> Observer | None:
-        """The observer of the run; None before there is one."""
-        return self._observer
+    def knows_memory(self) -> bool:
+        """Whether the voltage of the run, with its gaps, tells the outputs of all plays."""
+        # the observer learns of a gap when the displacement of its time is decided
+        gaps = any(np.isnan(block.prediction.t[0]) for block in self._waiting)
+        return self._observer is not None and self._observer.known and not gaps
 
     @property
     def span(self) -> float:

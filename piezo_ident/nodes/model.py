@@ -175,8 +175,7 @@ class ModelNode(LabNode):
     @property
     def _is_known(self) -> bool:
         """Whether the memory of the plays is known, from rest or from sweeps."""
-        observer = self._corrector.observer
-        return self._predictor.memory_known or (observer is not None and observer.known)
+        return self._predictor.memory_known or self._corrector.knows_memory
 
     @property
     def _is_lost(self) -> bool:

@@ -132,3 +132,15 @@ def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():
     told = [row for one in line.got for row in one.corrections]
     assert len(told) == N / FS * 100
     assert told[-1] == line.corrector.told and 0.0 < told[-1]['gain/std'] < 1e-2
+
+
+def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():
+    corrector = Corrector()
+    corrector.set_model(MODEL)
+    for first, knows in ((0, True), (100, True), (300, False)):
+        cut = slice(first, first + 100)
+        prediction = Samples(T[cut], Y[cut], '', 'displacement')
+        corrector.predicted(prediction, Samples(T[cut], V[cut]), known=True)
+        if first < 300:
+            corrector.measured(T[cut], Y[cut])
+        assert corrector.knows_memory == knows
