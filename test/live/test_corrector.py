@@ -141,6 +141,6 @@ def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():
         cut = slice(first, first + 100)
         prediction = Samples(T[cut], Y[cut], '', 'displacement')
         corrector.predicted(prediction, Samples(T[cut], V[cut]), known=True)
-        if first < 300:
+        if first < 100:
             corrector.measured(T[cut], Y[cut])
         assert corrector.knows_memory == knows
