@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.errors import DataError
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import Kind
@@ -22,16 +23,56 @@ from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
+#: what an observer tells of its corrections, and of which of its numbers
+CORRECTIONS = {
+    'offset/value': 'offset',
+    'offset/std': 'offset_std',
+    'creep/value': 'creep',
+    'creep/std': 'creep_std',
+    'memory/band': 'band',
+    'estimate/std': 'std',
+}
+#: the same of a gain that is followed
+GAIN = {'gain/value': 'gain', 'gain/std': 'gain_std'}
+#: corrections a second
+RATE = 50.0
+#: share of the span by which the band of unknown plays may shrink in a block that is judged: while
+#: plays become known what is left is a matter of them
+SETTLED = 1e-5
+#: share of the span from which creep of earlier motion is told
+FAINT = 1e-4
+#: standard deviations from which a change of the gain is told (taste)
+SURE = 3.0
 #: time of the stream for which displacement is waited for [s]
 PATIENCE = 0.5
 
 
+def gain_change(value: float, std: float) -> str:
+    """Return a change of the gain by size; empty where it is not sure."""
+    if not abs(value) > SURE * std > 0.0:
+        return ''
+    return f'gain {100.0 * value:+.1f} +- {max(100.0 * std, 0.05):.1f} %'
+
+
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """An estimate as a block, and what the observer says of its samples."""
+    """
+    An estimate as a block, and what the observer says of its samples.
+
+    Attributes
+    ----------
+    samples : Samples
+    seen : Observed
+    corrections : list of dict
+        The numbers of `CORRECTIONS`, of the first sample of each stretch of a steady rate.
+    is_settled : bool
+        Whether what is left is no matter of plays that become known.
+    """
 
     samples: Samples
     seen: Observed
+    corrections: list[dict[str, float]]
+    is_settled: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +92,30 @@ class Corrector:
     ----------
     horizon : int, optional
         [samples]
+    gain : bool, optional
+        Whether the gain is followed, too.
+    rate : float, optional
+        Corrections that are told a second of the stream.
+
+    Attributes
+    ----------
+    told : dict
+        The corrections that were told last.
     """
 
-    def __init__(self, horizon: int = HORIZON) -> None:
-        self._horizon = horizon
+    def __init__(self, horizon: int = HORIZON, gain: bool = False, rate: float = RATE) -> None:
+        self._horizon, self._gain, self._rate = horizon, gain, rate
         self._model: StageModel | None = None
+        self.told: dict[str, float] = {}
+        self._bin = -1
         self._forget()
 
     @property
-    def observer(self) -> Observer | None:
-        """The observer of the run; None before there is one."""
-        return self._observer
+    def knows_memory(self) -> bool:
+        """Whether the voltage of the run, with its gaps, tells the outputs of all plays."""
+        # the observer learns of a gap when the displacement of its time is decided
+        gaps = any(np.isnan(block.prediction.t[0]) for block in self._waiting)
+        return self._observer is not None and self._observer.known and not gaps
 
     @property
     def span(self) -> float:
@@ -73,10 +127,31 @@ class Corrector:
         self._model = model
         self._forget()
 
-    def set_horizon(self, horizon: int) -> None:
-        """Take another horizon, and begin anew."""
-        self._horizon = horizon
+    def set_up(self, horizon: int, gain: bool) -> None:
+        """Take another horizon, or follow the gain or not, and begin anew."""
+        self._horizon, self._gain = horizon, gain
+        self.told = {}
         self._forget()
+
+    def accept(self) -> str:
+        """Take the present step of the sensor as its zero; return what was accepted."""
+        if self._observer is None:
+            raise DataError('there is no estimate yet: no step to accept')
+        return f'a step of {1e6 * self._observer.accept():+.3g} um is taken as the zero'
+
+    @property
+    def corrected(self) -> str:
+        """What is corrected, by size."""
+        offset, creep, gain, std = (
+            self.told.get(name, 0.0)
+            for name in ('offset/value', 'creep/value', 'gain/value', 'gain/std')
+        )
+        parts = [f'offset {1e6 * offset:+.2g} um']
+        if abs(creep) > FAINT * self.span:
+            parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
+        if said := gain_change(gain, std):
+            parts.append(said)
+        return ', '.join(parts)
 
     def _forget(self) -> None:
         self._clock = BlockClock()
@@ -110,7 +185,7 @@ class Corrector:
             model = self._model
             if model.is_static:
                 model = replace(model, sample_rate=1.0 / period)
-            self._observer = Observer(model, horizon=self._horizon, known=known)
+            self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
         elif kind is Kind.GAP and self._last is not None:
             # as the prediction went on, over a straight line
             share = np.arange(1, missing + 1) / (missing + 1)
@@ -157,5 +232,17 @@ class Corrector:
                 # nobody saw the voltage
                 self._observer.lose_memory()
                 continue
-            done.append(Estimated(replace(block.prediction, values=seen.estimate), seen))
+            samples = replace(block.prediction, values=seen.estimate)
+            is_settled = bool(np.ptp(seen.band) <= SETTLED * self.span)
+            done.append(Estimated(samples, seen, self._tell(samples.t, seen), is_settled))
         return done
+
+    def _tell(self, t: Array, seen: Observed) -> list[dict[str, float]]:
+        """Return the corrections that begin a stretch."""
+        names = CORRECTIONS | (GAIN if self._gain else {})
+        # rounding may put a sample just before its stretch
+        bins = np.floor(t * self._rate + 1e-6).astype(np.int64)
+        first = np.flatnonzero(np.diff(bins, prepend=self._bin)).tolist()
+        rows = [{n: float(getattr(seen, x)[k]) for n, x in names.items()} for k in first]
+        self._bin, self.told = int(bins[-1]), rows[-1] if rows else self.told
+        return rows

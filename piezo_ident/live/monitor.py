@@ -14,6 +14,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
+from piezo_ident.model.observer import PATH
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.faults import MAX_WILD
 from piezo_ident.record.jumps import AROUND, least_step, wild_readings
@@ -26,6 +27,9 @@ CATCH_UP = 1.0
 MOST = 500
 #: number of bins after which a late quantity is no longer waited for
 LAG = 25
+#: share of the mean square of what is left that goes with the displacement, to tell it as a gain
+#: that is not followed (taste)
+EXPLAINED = 0.5
 #: samples on either side by which a reading is judged
 EDGE = AROUND + 4
 
@@ -262,7 +266,7 @@ class TrackingError:
 
 class LiveError:
     """
-    Mean and rms of the residual over a window of sample time [s].
+    Mean and rms of the residual over a window of sample time [s], and its slope.
 
     Wild readings are left out, as offline, where they are few.
     """
@@ -274,7 +278,7 @@ class LiveError:
 
     def clear(self) -> None:
         """Forget all samples."""
-        # begin and end of each stretch; number, sum and sum of squares of what is kept, and wild
+        # begin and end of each stretch; number and sums of what is kept, and wild
         self._parts: deque[tuple[float, float, Array, Array]] = deque()
         self._step = np.inf
         self._forget_last()
@@ -311,7 +315,7 @@ class LiveError:
 
     def _sorted(self, new: Array, stroke: float) -> tuple[Array, Array]:
         """Return the sums of what is kept and of what is wild, of all that has neighbours."""
-        e = new[0]
+        e, y = new
         wild = np.zeros(e.size, dtype=bool)
         if np.isfinite(stroke):
             e, y = x = np.concatenate([self._last, new], axis=1)
@@ -320,11 +324,12 @@ class LiveError:
             first = max(0, end - EDGE)
             self._last, self._judged = x[:, first:], end - first
             e = e[begin:end]
-        kept, out = (np.array([x.size, x.sum(), x @ x]) for x in (e[~wild], e[wild]))
+            y = y[begin:end]
+        kept, out = (_sums_of(e[w], (y - e)[w]) for w in (~wild, wild))
         return kept, out
 
     def _sums(self) -> tuple[Array, int]:
-        sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 3).sum(axis=0)
+        sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 7).sum(axis=0)
         kept, out = sums[0], sums[1]
         # what happens often is the way of the stage
         if out[0] > MAX_WILD * (kept[0] + out[0]):
@@ -344,11 +349,48 @@ class LiveError:
     @property
     def mean(self) -> float:
         """Mean [m]; NaN before the first sample."""
-        (n, total, _), _ = self._sums()
+        (n, total, *_), _ = self._sums()
         return float(total / n) if n else float('nan')
 
     @property
     def rms(self) -> float:
         """Root mean square [m]; NaN before the first sample."""
-        (n, _, square), _ = self._sums()
+        (n, _, square, *_), _ = self._sums()
         return float(np.sqrt(square / n)) if n else float('nan')
+
+    def gain(self, span: float) -> tuple[float, float]:
+        """
+        Return the slope of the residual against what was predicted, and its standard deviation.
+
+        The slope is that of least squares beside a mean.  What it leaves is correlated along the
+        path of the displacement, so that a path of twice that length is one value.
+
+        Parameters
+        ----------
+        span : float
+            Displacement of the model over its range [m].
+
+        Returns
+        -------
+        tuple of float
+            An infinite standard deviation where the residual does not go with the prediction, or
+            the stage did not move by the length of that correlation.
+        """
+        (n, e, ee, p, pp, pe, path), _ = self._sums()
+        if n < 2.0:
+            return 0.0, np.inf
+        ee, pp, pe = ee / n - (e / n) ** 2, pp / n - (p / n) ** 2, pe / n - e * p / n**2
+        # a uniform motion by that length
+        if 12.0 * pp < (PATH * span) ** 2:
+            return 0.0, np.inf
+        slope, left = pe / pp, ee - pe**2 / pp
+        if left > (1.0 - EXPLAINED) * ee:
+            return slope, np.inf
+        values = max(1.0, path / (2.0 * PATH * span))
+        return float(slope), float(np.sqrt(max(left, 0.0) / (values * pp)))
+
+
+def _sums_of(e: Array, p: Array) -> Array:
+    """Return number, sums and products of errors and predictions, and the path of these."""
+    path = np.abs(np.diff(p)).sum()
+    return np.array([e.size, e.sum(), e @ e, p.sum(), p @ p, p @ e, path])

@@ -28,7 +28,7 @@ class MemoryBounds:
     Attributes
     ----------
     low, high : ndarray, shape (m,) or, with k lags, (m + k + 1,)
-        As memories of `Hysteresis.follow`.
+        As memories of `Hysteresis.follow`; they stay where they met.
 
     Examples
     --------
@@ -67,7 +67,7 @@ class MemoryBounds:
     def follow(self, v: Array) -> Array:
         """Take the next voltages; return by how much w is unknown under each, shapes (n,)."""
         if np.array_equal(self.low, self.high):
-            self.low = self.high = self._h.follow(v, self.low)[1]
+            # the free run follows them from here on
             return np.zeros(v.size)
         floor, self.low = self._h.follow(v, self.low)
         ceiling, self.high = self._h.follow(v, self.high)

@@ -16,6 +16,12 @@ path of the voltage: at rest it stays as it is, and no time averages it out.  A 
 follows o, d and m by the means of groups of samples.  `estimate` is the free run plus offset and
 creep; m is no part of it, since what the model lacks must show.
 
+On request the gain is followed, too: g x more, of the free run x about the zero of the
+model, where g walks at random.  Only motion tells a gain from an offset.  What time adds to its
+variance waits until the voltage moves, and is freed along the path; at rest g stays as it is.  A
+step of the gain is refused first, as any step is.  It is followed as soon as the voltage has moved
+and what was refused goes with x.
+
 Two hypotheses run side by side, weighed by their likelihood: the zero is where it was, and it is
 anywhere.  Slow creep and a zero look alike at first, and a wide prior of the zero alone would take
 all that creep leaves.
@@ -61,6 +67,13 @@ PATH = 0.25
 WALK = 1e-3 / np.sqrt(60.0)
 #: rms size of the offset, in spans: a zero that was left alone, and one that is anywhere (taste)
 ZEROS = (1e-3, 1.0)
+#: rms change of the gain in a second: d33 of PZT changes by some 0.1 % a kelvin, and a stage that
+#: warms as it works by a kelvin in a minute
+GAIN_WALK = 1e-3 / np.sqrt(60.0)
+#: rms size of its change since identification (taste: some ten kelvin and lost poling)
+GAIN_SIZE = 0.1
+#: measurements in a row that make a step, and their spread over their mean (taste)
+STEADY, SPREAD = 10, 0.25
 #: rms size of d, as a share of the range of H: earlier motion was anywhere in it, equally likely
 BEYOND = 1.0 / np.sqrt(12.0)
 #: deviation beyond which a measurement is no information, in standard deviations (taste)
@@ -85,6 +98,8 @@ class Observed:
         since the start included, and its standard deviation.
     creep, creep_std : ndarray
         The same of creep from earlier motion.
+    gain, gain_std : ndarray
+        Relative change of the gain, and its standard deviation; zero where it is not observed.
     band : ndarray
         What plays of unknown output may still change of the offset as the voltage moves on.
     """
@@ -95,6 +110,8 @@ class Observed:
     offset_std: Array
     creep: Array
     creep_std: Array
+    gain: Array
+    gain_std: Array
     band: Array
 
 
@@ -118,6 +135,8 @@ class Observer:
         Standard deviations beyond which a measurement is first not believed.
     known : bool, optional
         Whether the free run has the memory of the plays; else it does at the lowest voltage alone.
+    gain : bool, optional
+        Whether the gain is followed, too.
     """
 
     def __init__(
@@ -130,6 +149,7 @@ class Observer:
         zeros: tuple[float, ...] | None = None,
         gate: float = GATE,
         known: bool = False,
+        gain: bool = False,
     ) -> None:
         if horizon < 1:
             raise DataError(f'observer: the horizon is at least one sample, got {horizon}')
@@ -140,14 +160,15 @@ class Observer:
         noisy = size if noise is None else max(noise / span, LEAST)
         self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
         self._group = max(1, round(GROUP * model.sample_rate))
-        self._law = self._laws(size, noisy, gate)
+        self._gain = gain
+        self._law, self._row = self._laws(size, noisy, gate)
         low, high = model.scaling.u(model.scaling.range).tolist()
         self._low, self._width = low, high - low
         self._input = model.input_chain()
         self._bounds = MemoryBounds(model.hysteresis, low, (low, high))
         self._is_known, self._started, self._is_lost = known, False, False
 
-    def _laws(self, error: float, noise: float, gate: float) -> kernel.Law:
+    def _laws(self, error: float, noise: float, gate: float) -> tuple[kernel.Law, Array]:
         model, rate, size = self.model, self.model.sample_rate, self._group
         gains, times = creep_elements(model)
         left = np.exp(-1.0 / (rate * times))
@@ -160,25 +181,32 @@ class Observer:
         walk = WALK**2 * size / rate
         # in the order of their places
         numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, reach**2]
-        return kernel.Law(
-            row=np.concatenate([[1.0], gains * before.mean(axis=1), [1.0]]),
+        numbers += [GAIN_WALK**2 * size / rate, GAIN_SIZE**2]
+        own = int(self._gain)
+        # that of the gain is another at each group
+        row = np.concatenate([[1.0], gains * before.mean(axis=1), np.zeros(own), [1.0]])
+        law = kernel.Law(
             lead=gains * left**self.horizon,
             left=left,
-            kept=np.append(1.0, left**size),
+            kept=np.concatenate([[1.0], left**size, np.ones(own)]),
             numbers=np.array(numbers),
         )
+        return law, row
 
     def _start(self, u0: float) -> None:
         law = self._law
-        n, count = law.row.size, self._zeros.size
+        n, count, c = self._row.size, self._zeros.size, law.left.size
         reach2 = law.numbers[kernel.REACH]
         P = np.zeros((count, n, n))
         for b, zero in enumerate(self._zeros):
-            P[b] = np.diag([zero**2, *[reach2] * (n - 2), law.numbers[kernel.ERROR]])
-        now = np.zeros(16)
+            P[b] = np.diag(
+                [zero**2, *[reach2] * c, *[0.0] * (n - 2 - c), law.numbers[kernel.ERROR]]
+            )
+        now = np.zeros(kernel.PLACES)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
-        group, coming = np.full(self._group, np.nan), np.zeros(law.left.size)
-        self._state = kernel.State(np.zeros((count, n)), P, np.zeros(count), group, coming, now)
+        now[kernel.IDLE] = self._gain * law.numbers[kernel.GAIN_SIZE]
+        x, weight, group = np.zeros((count, n)), np.zeros(count), np.full((2, self._group), np.nan)
+        self._state = kernel.State(x, P, weight, self._row.copy(), group, np.zeros(c), now)
         kernel.tell(law, self._state)
         self._input.reset(u0, u0)
         if self._is_known or u0 - self._low < REST * self._width:
@@ -196,6 +224,30 @@ class Observer:
     def lose_memory(self) -> None:
         """Take note that voltage was lost before the next sample."""
         self._is_lost = True
+
+    def accept(self) -> float:
+        """
+        Take the step of the sensor that is not believed yet as one of its zero; return it [m].
+
+        Raises
+        ------
+        DataError
+            When there is none, or what the sensor says is no step.
+        """
+        now = self._state.now if self._started else np.zeros(kernel.PLACES)
+        n, total, squares = now[kernel.SEEN], now[kernel.SUM_E], now[kernel.SUM_EE]
+        if n < STEADY:
+            raise DataError('the displacement is where the estimate has it: no step to accept')
+        step, um = total / n, 1e6 * self.model.scaling.Y
+        spread = float(np.sqrt(max(squares / n - step**2, 0.0)))
+        if spread > SPREAD * abs(step):
+            raise DataError(
+                f'what the sensor says changes as the stage moves, {um * step:+.3g} um with a '
+                f'standard deviation of {abs(um) * spread:.2g} um: it is no step of the zero'
+            )
+        self._state.P[:, 0, 0] += kernel.JUMP * step**2
+        kernel.forget_refused(now)
+        return float(self.model.scaling.Y * step)
 
     def process(self, v: Array, free: Array, measured: Array) -> Observed:
         """
@@ -230,8 +282,8 @@ class Observer:
             self._state.now[kernel.BAND] = band[0]
         whole = np.concatenate([self._past, new], axis=1)
         before, self._past = whole[:, : u.size].copy(), whole[:, u.size :]
-        out, y = np.empty((6, u.size)), scaling.x(measured)
-        kernel.follow(y, before[0], before[1], before[2], self._law, self._state, out)
+        out = np.empty((8, u.size))
+        kernel.follow(scaling.x(measured), before, new[0], self._law, self._state, out)
         Y = scaling.Y
         return Observed(
             estimate=free + Y * out[0],
@@ -240,6 +292,8 @@ class Observer:
             offset_std=abs(Y) * out[3],
             creep=Y * out[4],
             creep_std=abs(Y) * out[5],
+            gain=out[6],
+            gain_std=out[7],
             band=abs(Y) * band,
         )
 

@@ -18,21 +18,31 @@ FAINT = -30.0
 #: variance of the offset, over the mean square of what was refused, once that is believed: nine
 #: tenths of it count as offset, the rest as error of the model (taste)
 JUMP = 9.0
+#: share of what an offset leaves of refused measurements that a gain may leave, to be it (taste)
+EXPLAINED = 0.1
+#: size of a change of the gain that is no fault of the sensor, in rms sizes (taste)
+LIKELY = 3.0
+#: path over which it is seen on what strokes a gain stands, in lengths of the error (taste)
+STROKES = 10.0
 
 # places of the numbers that `State.now` holds
 COUNT, PATH, BAND, MOVED, SPREAD, SCALE, REFUSED, SCORES, READING, BEGAN = range(10)
 OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
+# and with a gain: mean free run of the group, variance of the gain that motion has not freed yet,
+# and mean and variance of the free run over the last few strokes
+FREE, IDLE, GAIN, GAIN_VAR, CROSS, MEAN_X, VAR_X = range(16, 23)
+# sums over measurements that were refused, of their innovations e and of the free run x
+SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE, PLACES = range(23, 30)
 # places of the numbers that `Law.numbers` holds
-NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH = range(8)
+NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE = range(10)
 
 
 class Law(NamedTuple):
     """What a filter knows from the start: rows of the states, and numbers."""
 
-    row: Array  # of offset, creep and m in the mean of a group
     lead: Array  # of creep in the displacement a horizon later
     left: Array  # share of each element of creep after a sample
-    kept: Array  # the same of offset, creep after a group
+    kept: Array  # the same of offset, creep, gain after a group
     numbers: Array
 
 
@@ -42,28 +52,37 @@ class State(NamedTuple):
     x: Array  # (b, n)
     P: Array  # (b, n, n)
     weight: Array  # (b,), logarithms
-    group: Array  # residual of the group, NaN where there is none
+    row: Array  # (n,), of offset, creep, gain and m in the mean of a group
+    group: Array  # (2, size), residual of the group and free run; NaN where there is none
     coming: Array  # creep in the displacement a horizon later, by element
     now: Array
 
 
 @ordered_kernel
-def _typical(group: Array, noise: float) -> tuple[float, int]:
-    # mean of the numbers that are not far from the median, and how many they are
-    x = np.sort(group[np.isfinite(group)])
+def _typical(group: Array, noise: float) -> tuple[float, float, int]:
+    # mean of the numbers that are not far from the median, of the free run there, and their count
+    finite = np.isfinite(group[0])
+    x = np.sort(group[0][finite])
     n = x.size
-    if n < 3:
-        return (x.sum() / n if n else 0.0), n
-    middle = 0.5 * (x[(n - 1) // 2] + x[n // 2])
-    off = np.sort(np.abs(x - middle))
-    # six standard deviations: 6 / 0.6745 medians of the size
-    limit = 8.9 * off[n // 2] + 6.0 * noise
-    total, count = 0.0, 0
-    for k in range(n):
-        if abs(x[k] - middle) <= limit:
-            total += x[k]
+    middle, limit = 0.0, np.inf
+    if n >= 3:
+        middle = 0.5 * (x[(n - 1) // 2] + x[n // 2])
+        off = np.sort(np.abs(x - middle))
+        # six standard deviations: 6 / 0.6745 medians of the size
+        limit = 8.9 * off[n // 2] + 6.0 * noise
+    total, free, count = 0.0, 0.0, 0
+    for k in range(finite.size):
+        if finite[k] and abs(group[0, k] - middle) <= limit:
+            total += group[0, k]
+            free += group[1, k]
             count += 1
-    return total / count, count
+    return total / max(count, 1), free / max(count, 1), count
+
+
+@ordered_kernel
+def _has_gain(law: Law, s: State) -> bool:
+    # offset and m stand beside creep; a gain stands before m
+    return s.row.size > law.lead.size + 2
 
 
 @ordered_kernel
@@ -80,16 +99,27 @@ def _let_time_pass(law: Law, s: State) -> None:
         # what unknown plays add has changed by anything up to the shrinking, equally likely
         s.P[b, 0, 0] += numbers[WALK] + (now[MOVED] ** 2 - now[SPREAD] ** 2) / 3.0
         s.P[b, n - 1, n - 1] += now[SCALE] * numbers[ERROR] * (1.0 - phi * phi)
+    if _has_gain(law, s):
+        # time makes the gain less sure, but a reading tells of that only along a path
+        share = 1.0 - phi ** (1.0 / STROKES)
+        d = now[FREE] - now[MEAN_X]
+        now[MEAN_X] += share * d
+        now[VAR_X] = (1.0 - share) * (now[VAR_X] + share * d * d)
+        idle = min(now[IDLE] + numbers[GAIN_WALK], numbers[GAIN_SIZE])
+        now[IDLE] = idle * phi * phi
+        for b in range(hypotheses):
+            room = max(0.0, numbers[GAIN_SIZE] - s.P[b, n - 2, n - 2])
+            s.P[b, n - 2, n - 2] += min(idle - now[IDLE], room)
     now[SPREAD], now[PATH] = now[MOVED], 0.0
 
 
 @ordered_kernel
 def _innovation(law: Law, s: State, b: int, mean: float, noise: float) -> tuple[float, float]:
     off, power = mean, noise
-    for i in range(law.row.size):
-        off -= law.row[i] * s.x[b, i]
-        for j in range(law.row.size):
-            power += law.row[i] * s.P[b, i, j] * law.row[j]
+    for i in range(s.row.size):
+        off -= s.row[i] * s.x[b, i]
+        for j in range(s.row.size):
+            power += s.row[i] * s.P[b, i, j] * s.row[j]
     return off, power
 
 
@@ -104,33 +134,71 @@ def _rescale(law: Law, s: State, scale: float) -> None:
 
 
 @ordered_kernel
+def forget_refused(now: Array) -> None:
+    """Forget what was refused so far."""
+    now[REFUSED] = now[SCORES] = 0.0
+    now[SEEN:PLACES] = 0.0
+
+
+@ordered_kernel
+def _note_refused(now: Array, e: float) -> None:
+    x = now[FREE]
+    now[SEEN] += 1.0
+    now[SUM_E] += e
+    now[SUM_EE] += e * e
+    now[SUM_X] += x
+    now[SUM_XX] += x * x
+    now[SUM_XE] += x * e
+
+
+@ordered_kernel
+def _is_gain(law: Law, now: Array) -> bool:
+    # whether what was refused goes with the displacement, and is no step of the zero
+    size, n = law.numbers[GAIN_SIZE], now[SEEN]
+    swept = now[SUM_XX] - now[SUM_X] ** 2 / n
+    # the error of a model goes with a shorter path as well
+    if 12.0 * swept < n * law.numbers[LENGTH] ** 2:
+        return False
+    by_gain = now[SUM_EE] - now[SUM_XE] ** 2 / now[SUM_XX]
+    by_zero = now[SUM_EE] - now[SUM_E] ** 2 / n
+    likely = now[SUM_XE] ** 2 <= LIKELY**2 * size * now[SUM_XX] ** 2
+    return bool(likely and by_gain <= EXPLAINED * by_zero)
+
+
+@ordered_kernel
 def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
     # judge a measurement by the hypothesis that it suits best; what lasts is believed in the end
     numbers, now = law.numbers, s.now
     noise = now[SCALE] * numbers[NOISE] / count
-    score, power = np.inf, 0.0
+    score, power, e = np.inf, 0.0, 0.0
     for b in range(s.weight.size):
         off, size = _innovation(law, s, b, mean, noise)
         if off * off < score * size:
-            score, power = off * off / size, size
+            score, power, e = off * off / size, size, off
     if score <= numbers[GATE]:
         now[REFUSED] = max(0.0, now[REFUSED] - 1.0)
         if now[REFUSED] == 0.0:
-            now[SCORES] = 0.0
+            forget_refused(now)
         # a model that errs by more than it says is believed less
         _rescale(law, s, now[SCALE] * (1.0 + numbers[GROWTH] * (score - 1.0)))
         return True
     now[REFUSED] += 1.0
     now[SCORES] += score
+    _note_refused(now, e)
+    if _has_gain(law, s) and _is_gain(law, now):
+        for b in range(s.weight.size):
+            s.P[b, -2, -2] += JUMP * (now[SUM_XE] / now[SUM_XX]) ** 2
+        forget_refused(now)
+        return True
     if now[REFUSED] < numbers[LAST]:
         return False
     score = now[SCORES] / now[REFUSED]
     _rescale(law, s, now[SCALE] * score)
-    now[REFUSED] = now[SCORES] = 0.0
+    forget_refused(now)
     for b in range(s.weight.size):
         s.P[b, 0, 0] += JUMP * score * power
         # what was found of creep may stand on an error of the model
-        for i in range(1, s.x.shape[1] - 1):
+        for i in range(1, 1 + law.lead.size):
             s.P[b, i, i] += numbers[REACH]
     return True
 
@@ -145,7 +213,7 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
         shared = np.zeros(n)
         for i in range(n):
             for j in range(n):
-                shared[i] += s.P[b, i, j] * law.row[j]
+                shared[i] += s.P[b, i, j] * s.row[j]
         for i in range(n):
             s.x[b, i] += shared[i] * off / power
             for j in range(n):
@@ -164,6 +232,7 @@ def tell(law: Law, s: State) -> None:
     share = np.exp(s.weight)
     share /= share.sum()
     offset, squares, creep, creeps, whole = 0.0, 0.0, 0.0, 0.0, 0.0
+    gain, gains, crossed = 0.0, 0.0, 0.0
     s.coming[:] = 0.0
     for b in range(share.size):
         a, z, var, cross = s.x[b, 0], 0.0, 0.0, 0.0
@@ -173,6 +242,14 @@ def tell(law: Law, s: State) -> None:
             cross += law.lead[i] * s.P[b, 0, 1 + i]
             for j in range(law.lead.size):
                 var += law.lead[i] * s.P[b, 1 + i, 1 + j] * law.lead[j]
+        if _has_gain(law, s):
+            g = s.x[b, -2]
+            with_gain = s.P[b, 0, -2]
+            for i in range(law.lead.size):
+                with_gain += law.lead[i] * s.P[b, 1 + i, -2]
+            gain += share[b] * g
+            gains += share[b] * (s.P[b, -2, -2] + g * g)
+            crossed += share[b] * (with_gain + (a + z) * g)
         offset += share[b] * a
         creep += share[b] * z
         squares += share[b] * (s.P[b, 0, 0] + a * a)
@@ -180,48 +257,74 @@ def tell(law: Law, s: State) -> None:
         whole += share[b] * (s.P[b, 0, 0] + 2.0 * cross + var + (a + z) ** 2)
     now[OFFSET], now[OFFSET_VAR] = offset, max(squares - offset * offset, 0.0)
     now[CREEP], now[CREEP_VAR] = creep, max(creeps - creep * creep, 0.0)
+    now[GAIN], now[GAIN_VAR] = gain, max(gains - gain * gain, 0.0)
+    now[CROSS] = crossed - (offset + creep) * gain
     now[VAR] = max(whole - (offset + creep) ** 2, 0.0)
     now[VAR] += max(now[SCALE] * law.numbers[ERROR], now[MISFIT])
 
 
 @ordered_kernel
-def follow(
-    y: Array, free: Array, path: Array, band: Array, law: Law, s: State, out: Array
-) -> None:
-    """
-    Take y, free run, path and band of a horizon before; write what is corrected, shapes (n,).
+def _gain_std(law: Law, s: State) -> float:
+    # a motion that repeats repeats the error of the model, whose slope no time averages out: each
+    # of the two branches has a value a twice its length
+    if not _has_gain(law, s):
+        return 0.0
+    now, size = s.now, law.numbers[GAIN_SIZE]
+    values = max(1.0, np.sqrt(12.0 * now[VAR_X]) / law.numbers[LENGTH])
+    slope = now[SCALE] * law.numbers[ERROR] / (values * max(now[VAR_X], 1e-12))
+    return float(np.sqrt(min(now[GAIN_VAR] + now[IDLE] + slope, size)))
 
-    Rows of out: the whole correction, offset and creep, with the standard deviation behind each.
+
+@ordered_kernel
+def _end_group(law: Law, s: State) -> None:
+    now = s.now
+    _let_time_pass(law, s)
+    mean, free, count = _typical(s.group, np.sqrt(law.numbers[NOISE]))
+    if count > 0:
+        now[FREE] = free
+    if _has_gain(law, s):
+        s.row[-2] = now[FREE]
+    enough = 2 * count >= s.group.shape[1]
+    if enough and _is_believed(law, s, mean, count):
+        _measure(law, s, mean, count)
+        now[MOVED] = now[SPREAD] = 0.0
+    tell(law, s)
+
+
+@ordered_kernel
+def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array) -> None:
     """
-    now, size = s.now, s.group.size
+    Take y, and free run, path and band, of a horizon before; write what is corrected.
+
+    Rows of out, of shape (8, n): the whole correction of the free run of now, offset, creep and
+    gain, with the standard deviation behind each.
+    """
+    now, size = s.now, s.group.shape[1]
+    gain_std = _gain_std(law, s)
     for k in range(y.size):
-        if np.isnan(free[k]):  # before the start
-            out[0, k], out[1, k] = 0.0, np.sqrt(now[VAR])
-            out[2, k], out[3, k] = 0.0, np.sqrt(now[OFFSET_VAR])
-            out[4, k], out[5, k] = 0.0, np.sqrt(now[CREEP_VAR])
-            continue
-        if y[k] != now[READING] and np.isfinite(y[k]):
-            now[READING], now[BEGAN] = y[k], free[k]
-        stuck = abs(free[k] - now[BEGAN]) > STUCK
-        s.group[int(now[COUNT])] = np.nan if stuck else y[k] - free[k]
-        now[COUNT] += 1.0
-        now[PATH] += path[k]
-        now[MOVED] += abs(now[BAND] - band[k])
-        now[BAND] = band[k]
-        for i in range(law.left.size):
-            s.coming[i] *= law.left[i]
-        if now[COUNT] == size:
-            _let_time_pass(law, s)
-            now[COUNT] = 0.0
-            mean, count = _typical(s.group, np.sqrt(law.numbers[NOISE]))
-            if 2 * count >= size and _is_believed(law, s, mean, count):
-                _measure(law, s, mean, count)
-                now[MOVED] = now[SPREAD] = 0.0
-            tell(law, s)
+        then, x = before[0, k], free[k]
         creep = 0.0
-        for i in range(law.left.size):
-            creep += s.coming[i]
-        out[0, k] = now[OFFSET] + creep
-        out[1, k] = np.sqrt(now[VAR])
+        if not np.isnan(then):  # else before the start
+            if y[k] != now[READING] and np.isfinite(y[k]):
+                now[READING], now[BEGAN] = y[k], then
+            stuck = abs(then - now[BEGAN]) > STUCK
+            s.group[0, int(now[COUNT])] = np.nan if stuck else y[k] - then
+            s.group[1, int(now[COUNT])] = then
+            now[COUNT] += 1.0
+            now[PATH] += before[1, k]
+            now[MOVED] += abs(now[BAND] - before[2, k])
+            now[BAND] = before[2, k]
+            for i in range(law.left.size):
+                s.coming[i] *= law.left[i]
+            if now[COUNT] == size:
+                _end_group(law, s)
+                gain_std = _gain_std(law, s)
+                now[COUNT] = 0.0
+            for i in range(law.left.size):
+                creep += s.coming[i]
+        out[0, k] = now[OFFSET] + creep + now[GAIN] * x
+        whole = now[VAR] + 2.0 * now[CROSS] * x + now[GAIN_VAR] * x * x
+        out[1, k] = np.sqrt(max(whole, 0.0))
         out[2, k], out[3, k] = now[OFFSET], np.sqrt(now[OFFSET_VAR])
         out[4, k], out[5, k] = creep, np.sqrt(now[CREEP_VAR])
+        out[6, k], out[7, k] = now[GAIN], gain_std

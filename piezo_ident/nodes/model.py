@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.corrector import Corrector, Estimated
+from piezo_ident.live.corrector import Corrector, Estimated, gain_change
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
@@ -26,17 +26,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
-#: what the observer tells on `corrections`, and of which of its numbers
-CORRECTIONS = {
-    'offset/value': 'offset',
-    'offset/std': 'offset_std',
-    'creep/value': 'creep',
-    'creep/std': 'creep_std',
-    'memory/band': 'band',
-    'estimate/std': 'std',
-}
-#: share of the span by which the band of unknown plays may shrink in a block that is judged
-SETTLED = 1e-5
 #: how long a problem of the stream stays in the status [s], and how many of them
 REMEMBER, MOST = 5.0, 4
 #: share of the predictions of a second that must meet a displacement, and for how many seconds
@@ -55,11 +44,10 @@ class ModelNode(LabNode):
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
-        self._corrector, self._estimates = Corrector(self.values['horizon']), Matcher()
-        # of the estimate, and what was corrected last
+        values = [self.values[name] for name in ('horizon', 'observe_gain', 'preview_rate')]
+        self._corrector, self._estimates = Corrector(*values), Matcher()
+        # of the estimate
         self._left = LiveError(self.values['window'])
-        self._seen: dict[str, float] = {}
-        self._bin = -1
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
@@ -69,6 +57,7 @@ class ModelNode(LabNode):
         # samples of displacement that came again, until the last second
         self._again = 0
         self._models = 0
+        self.offer('accept', self._corrector.accept)
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
@@ -94,8 +83,10 @@ class ModelNode(LabNode):
             self._loader.load_file(path)
         if 'window' in changed:
             self._error.window = self._left.window = changed['window']
-        if 'horizon' in changed:
-            self._corrector.set_horizon(changed['horizon'])
+        if {'horizon', 'observe_gain'} & set(changed):
+            new = {**self.values, **changed}
+            self._corrector.set_up(new['horizon'], new['observe_gain'])
+            self._left.clear()
 
     def _take_model(self, model: StageModel | None, source: str) -> None:
         try:
@@ -184,8 +175,7 @@ class ModelNode(LabNode):
     @property
     def _is_known(self) -> bool:
         """Whether the memory of the plays is known, from rest or from sweeps."""
-        observer = self._corrector.observer
-        return self._predictor.memory_known or (observer is not None and observer.known)
+        return self._predictor.memory_known or self._corrector.knows_memory
 
     @property
     def _is_lost(self) -> bool:
@@ -193,20 +183,15 @@ class ModelNode(LabNode):
         return self._predictor.memory_lost and not self._is_known
 
     def _correct(self, several: list[Estimated]) -> None:
-        stroke = self._corrector.span
         for one in several:
-            samples, seen = one.samples, one.seen
+            samples = one.samples
             self._estimate.publish(to_message(samples))
             self._publish_preview(self._preview.add('estimate', samples.t, samples.values))
-            bins = np.floor(samples.t * self._preview.rate + 1e-6).astype(np.int64)
-            for k in np.flatnonzero(np.diff(bins, prepend=self._bin)).tolist():
-                self._seen = {n: float(getattr(seen, x)[k]) for n, x in CORRECTIONS.items()}
-                message = JointState(name=list(self._seen), position=list(self._seen.values()))
+            for told in one.corrections:
+                message = JointState(name=list(told), position=list(told.values()))
                 message.header.stamp = self.get_clock().now().to_msg()
                 self._corrections.publish(message)
-            self._bin = int(bins[-1])
-            # while plays become known what is left is a matter of them
-            if np.ptp(seen.band) <= SETTLED * stroke:
+            if one.is_settled:
                 self._left_by(self._estimates.predicted(samples))
 
     def _left_by(self, pairs: list[Matched]) -> None:
@@ -244,13 +229,11 @@ class ModelNode(LabNode):
             return '', ''
         if left > ratio * before:
             said = f'{left:.3g} % of stroke, {left / before:.1f} times that at identification'
+            if gain := gain_change(*self._left.gain(span)):
+                said += f', and goes with the displacement: {gain}'
             return f'identify again, or diagnose on this motion: the live error is {said}', ''
         if self._error.seconds and self._live_error(model) > ratio * before:
-            offset, creep = (self._seen.get(f'{x}/value', 0.0) for x in ('offset', 'creep'))
-            parts = [f'offset {1e6 * offset:+.2g} um']
-            if abs(creep) > 1e-4 * span:
-                parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
-            return '', f'corrected: {", ".join(parts)}'
+            return '', f'corrected: {self._corrector.corrected}'
         return '', ''
 
     def _left_out(self) -> str:
@@ -324,7 +307,7 @@ class ModelNode(LabNode):
         values['outliers'] = self._error.outliers
         values['estimate_rms'] = f'{self._left.rms:.6g}'
         values['estimate_percent'] = f'{percent(self._left.rms, self._corrector.span):.4g}'
-        values |= {name: f'{x:.6g}' for name, x in self._seen.items()}
+        values |= {name: f'{x:.6g}' for name, x in self._corrector.told.items()}
         verdict, corrected = (mismatch, '') if mismatch else self._verdict()
         problems = [verdict, self._left_out()]
         if again:

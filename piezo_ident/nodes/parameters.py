@@ -208,6 +208,7 @@ MODEL = (
         1,
         100_000,
     ),
+    Declaration('observe_gain', False, 'whether the estimate follows the gain of the stage, too'),
 )
 
 RECORDER = (

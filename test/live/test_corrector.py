@@ -117,3 +117,30 @@ def test_a_gap_of_voltage_and_a_restart_keep_it_going(missing):
     assert t.size == N - min(missing, 4000) + 4100
     assert np.isfinite(y).all()
     assert np.abs(y[-2000:] - Y[2100:4100]).max() < 2e-7
+
+
+def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():
+    line = Line()
+    line.corrector = Corrector(gain=True, rate=100.0)
+    line.corrector.set_model(MODEL)
+    for k in range(0, N, 100):
+        line.voltage(slice(k, k + 100))
+        line.displacement(slice(k, k + 100))
+    _, y = line.rows
+    expected = observe(MODEL, Piece(V, Y, FS), gain=True).estimate
+    assert_allclose(y, expected, rtol=0, atol=1e-12 * 75e-6)
+    told = [row for one in line.got for row in one.corrections]
+    assert len(told) == N / FS * 100
+    assert told[-1] == line.corrector.told and 0.0 < told[-1]['gain/std'] < 1e-2
+
+
+def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():
+    corrector = Corrector()
+    corrector.set_model(MODEL)
+    for first, knows in ((0, True), (100, True), (300, False)):
+        cut = slice(first, first + 100)
+        prediction = Samples(T[cut], Y[cut], '', 'displacement')
+        corrector.predicted(prediction, Samples(T[cut], V[cut]), known=True)
+        if first < 100:
+            corrector.measured(T[cut], Y[cut])
+        assert corrector.knows_memory == knows

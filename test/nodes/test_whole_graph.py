@@ -44,7 +44,7 @@ def whole(tmp_path_factory):
             ('excitation', {'subscribers': 3, 'block_size': 500}),
             ('stage', {'seed': 3}),
             ('identifier', {**QUICK, 'program': PROGRAM}),
-            ('model', {'window': 0.5}),
+            ('model', {'window': 0.5, 'observe_gain': True}),
             ('recorder', {'output': str(folder / 'bag')}),
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
             ('feedforward', {'silence': 0.2, 'ramp_slew': 200.0, 'window': 0.2}),
