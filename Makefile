@@ -26,21 +26,18 @@ demo: .venv/.demo
 # the tests that mostly compute, with mypy beside them, those of node processes, then, one after the
 # other, what loads the machine and what judges seconds; the slowest files start first.  A file of
 # the first stays in one process.  The middleware may end a process of the second, and only
-# `worksteal` goes on then: `loadfile` waits for ever.  What another program's burst made fail is
-# asked once more, alone
+# `worksteal` goes on then: `loadfile` waits for ever
 PARALLEL := -n 2 -m 'not timed and not loads'
 FILES := --dist loadfile --no-loadscope-reorder
 ALONE := -m 'timed or loads' test/nodes
-AGAIN := --last-failed --last-failed-no-failures none
 
 test: .venv/.test
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy & types=$$!; \
 	.venv/bin/pytest $(PARALLEL) $(FILES) --ignore=test/nodes $(PYTEST_ARGS); rc=$$?; wait $$types && exit $$rc
-	.venv/bin/pytest $(PARALLEL) --dist worksteal test/nodes $(PYTEST_ARGS) || \
-	.venv/bin/pytest $(AGAIN) -m 'not timed and not loads' test/nodes $(PYTEST_ARGS)
-	.venv/bin/pytest $(ALONE) $(PYTEST_ARGS) || .venv/bin/pytest $(AGAIN) $(ALONE) $(PYTEST_ARGS)
+	.venv/bin/pytest $(PARALLEL) --dist worksteal test/nodes $(PYTEST_ARGS)
+	.venv/bin/pytest $(ALONE) $(PYTEST_ARGS)
 
 lint: .venv/.test
 	.venv/bin/ruff check .

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a stage will err by under the voltage of an inverse, as far as its model tells.
+Predict the error of a stage under the voltage of an inverse.
 
-The zero of a stage and the shape of its motion are two things.  A diagnosis takes the zero of each
-record as free, so what a model errs by is that of the shape; where the stage is, is a matter of
-what still creeps, which a model with creep knows.
+The prediction has two parts.  The shape of the motion errs as the model does: a diagnosis fits the
+zero of each record, so the error of a model holds for the shape alone.  The zero of the stage is
+shifted by creep from earlier motion, which a model with creep predicts.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from piezo_ident.model.metrics import worst_error
 from piezo_ident.model.stage_model import StageModel
 from scipy.signal import butter, sosfiltfilt
 
-#: time of a way to the beginning of a motion, and of a wait there [s]
+#: time of the stroke to the beginning of a motion, and of the wait there [s]; taste
 RISE, HOLD = 0.2, 1.0
-#: what is left to creep that is worth a warning where nothing is known of the model [of its span]
+#: remaining creep that is worth a warning if the error of the model is unknown [of its span]
 MATTERS = 1e-3
 
 
 @dataclass(frozen=True)
 class Expectation:
     """
-    What a stage will err by [m].
+    Expected error of a stage [m].
 
-    `rms` is that without its mean, None where the model does not tell how well it holds; `offset`
-    is the mean, None for a model without creep.
+    `rms` is the error without its mean, None if the error of the model is unknown.  `offset` is
+    the mean error, None for a model without creep.
     """
 
     rms: float | None
@@ -44,16 +44,16 @@ class Expectation:
 
 
 def known_rms(model: StageModel) -> float | None:
-    """Return what a model errs by on the kind of motion that it knows least [m]."""
+    """Error of a model on its worst kind of motion [m]; None if it is unknown."""
     worst = worst_error(model)
     return None if worst is None else 0.01 * worst * abs(model.scaling.Y)
 
 
 def expect(model: StageModel, v: Array, y: Array) -> Expectation:
     """
-    Return what is to be expected of a stage that is to move as y [m] under v [V], shape (n,) each.
+    Predict the error of a stage whose wanted displacement is y [m] under v [V], shape (n,) each.
 
-    The stage comes from its lowest voltage, and waits for `HOLD` where the motion begins.
+    The stage comes from its lowest voltage, and waits for `HOLD` at the first position.
     """
     known, late = known_rms(model), _late(model, v)[-y.size :]
     limit = MATTERS * abs(model.scaling.Y) if known is None else known
@@ -64,20 +64,19 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
         if fast > known:
             warnings.append(
                 f'{100 * fast / np.ptp(y):.2g} % of the motion lie above {mode:.4g} Hz, where the '
-                'stage rings: corners or jumps. The model may miss all of that, which is in what '
-                'is expected; round the corners, or let the scan learn'
+                'stage rings: corners or jumps. The model may miss all of it, and the expected '
+                'error contains it; round the corners, or let the scan learn'
             )
         if _is_slow(model):
             warnings.append(
-                'the record of the identification did not tell how the stage follows fast motion: '
-                'what is expected holds for motion as slow as that alone; identify it with steps '
-                'or noise'
+                'the record of the identification held no fast motion, so the expected error '
+                'holds for motion as slow as in that record; identify with steps or noise'
             )
     if late.size and abs(late[0]) >= limit:
         low = model.scaling.range[0]
         warnings.append(
             f'the stage creeps: {HOLD:g} s after it came from {low:g} V, '
-            f'{1e6 * abs(late[0]):.2g} um are left to where the motion begins; wait longer, or '
+            f'it is still {1e6 * abs(late[0]):.2g} um off the first position; wait longer, or '
             f'begin it under {low:g} V'
         )
     drifts = float(np.std(late)) if late.size else 0.0
@@ -89,7 +88,7 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
 
 
 def _is_slow(model: StageModel) -> bool:
-    """Return whether a model has no dynamics, and no diagnosis told what it misses thereby."""
+    """Return whether G is unknown and no diagnosis measured the error on fast motion."""
     missing = model.identification.get('not_identified')
     if 'diagnosis' in model.identification or not isinstance(missing, Sequence):
         return False
@@ -97,7 +96,7 @@ def _is_slow(model: StageModel) -> bool:
 
 
 def _above_mode(model: StageModel, y: Array) -> float:
-    """Return the rms of a motion above the lowest mode that rings [m]."""
+    """Rms of the part of a motion above the lowest mode that rings [m]."""
     mode = lowest_mode(model)
     if not (0.0 < mode < 0.5 * model.sample_rate) or not np.ptp(y):
         return 0.0
@@ -108,7 +107,7 @@ def _above_mode(model: StageModel, y: Array) -> float:
 
 
 def _late(model: StageModel, v: Array) -> Array:
-    """Return where a stage that creeps is beside one that rested at first [m]; empty without."""
+    """Displacement through creep from the stroke and wait before v [m]; empty without creep."""
     only = replace(model, effects=tuple(e for e in model.effects if e.name == Creep.name))
     if not only.effects:
         return np.empty(0)

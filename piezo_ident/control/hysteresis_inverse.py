@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The inverse of H: the voltage under which H is what is wanted, sample by sample.
+Invert H sample by sample.
 
-Between two samples H is a function of the new voltage alone, and a rising one where H has an
-inverse.  So each sample is a root of one unknown, which Newton's steps within a bracket find from
-the sample before; the plays then move on, as under the voltage that was found.  That serves every
-law of H alike.  Where H falls behind a turn of the voltage, within its narrowest plays, these are
-taken for lines: the voltage would jump at each turn otherwise, however small, also at rest.
+Given the memory of H, its next value is a function of the next voltage alone.  This function
+rises if H has an inverse.  Each sample is therefore a root in one unknown.  Newton steps within a
+bracket find it, starting at the sample before; then the memory moves on under the voltage that was
+found.  This works for every law of H.  H may fall within its narrowest plays after a turn of the
+voltage.  Straight lines then replace these plays, or the voltage would jump at each small turn,
+even at rest.
 
 For a sum of plays without a cubic the inverse is a sum of plays again:
 K. Kuhnen, "Modeling, identification and compensation of complex hysteretic nonlinearities",
@@ -29,25 +30,25 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import curve, curve_slope, held
 
-#: largest difference of H from what is wanted at a root, normalised
+#: largest error of H at a root, normalised
 TOLERANCE = 1e-13
-#: evaluations of H for a sample, at most
+#: most evaluations of H for a sample
 TRIALS = 80
-#: least slope of H by which Newton's step divides
+#: smallest slope of H by which a Newton step divides
 FLAT = 1e-6
-#: voltages at which H is checked to rise beyond its span
+#: number of voltages at which H is checked beyond its span
 FINE = 513
-#: thresholds, as a share of the span, of plays that may be taken for lines; taste: a real loop is
-#: several times as wide, and a line misses a play by half its threshold
+#: largest threshold of a play that a line may replace, as a share of the span; taste: a real loop
+#: is several times as wide, and a line errs by half the threshold
 NARROW = 0.02
 
 
 @kernel
 def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tuple[float, float]:
     """
-    Return what the plays of H add at u, and its slope; `after` takes their outputs.
+    Sum the plays of H at u; the sum and its slope.  `after` takes their outputs.
 
-    Each may lag u by ``band[0]`` and lead it by ``band[1]``.
+    Each play may lag u by ``band[0]`` and lead it by ``band[1]``.
     """
     w, slope = 0.0, 0.0
     for i in range(q.size):
@@ -62,7 +63,7 @@ def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tupl
 def _wide_plays(
     u: float, band: Array, q: Array, low: float, c: Array, memory: Array, after: Array
 ) -> tuple[float, float]:
-    """Do as `_plays`, with curves and bias; in one loop, which is a third faster than two."""
+    """Sum plays with curves and bias as `_plays` does; one loop is a third faster than two."""
     w, slope = 0.0, 0.0
     for i in range(q.size):
         f = held(memory[i], u - band[0, i], u + band[1, i])
@@ -77,18 +78,18 @@ def _wide_plays(
 @ordered_kernel
 def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
     """
-    Return what the lags along the path add at u, and its slope; `after` takes them.
+    Sum the lags along the path at u; the sum and its slope.  `after` takes their outputs.
 
-    As `piezo_ident.operators.kernels.relaxing`, of a single sample.
+    Equals `piezo_ident.operators.kernels.relaxing` for a single sample.
     """
     w, slope, before, left, last = 0.0, 0.0, 0.0, 1.0, z[lags.shape[0]]
     way = 1.0 if u > last else -1.0
     for j in range(lags.shape[0]):
         a, d1, d2, d3 = lags[j, 0], lags[j, 1], lags[j, 2], lags[j, 3]
-        # of twice the rate the square is left
+        # a lag of twice the rate decays by the square
         left = left * left if a == 2.0 * before else np.exp(-a * abs(u - last))
         before, b = a, way / a
-        # a line's own answer, in the place of phi
+        # answer of the lag to its own curve
         c2 = d2 - 3.0 * b * d3
         c1 = d1 - 2.0 * b * c2
         c0 = -b * c1
@@ -125,11 +126,10 @@ def _invert(
     reached: Array,
 ) -> None:
     """
-    Write the voltages under which H is as wanted to `out`, and what H is to `reached`.
+    Write the voltage for each wanted value of H to `out`, and the value reached to `reached`.
 
-    `last` holds the voltage of H and H before, a slope of H, and the voltage before the lag; it is
-    carried on with `memory`.  With `power`, shape (n,), the plays of each sample are as wide as
-    `growth` says.
+    `last` holds the last voltage of H, H, its slope, and the voltage before the lag; the function
+    updates it and `memory`.  With `power`, shape (n,), the plays widen as `growth` says.
     """
     after, grows = memory.copy(), power.size > 0
     band = np.zeros((2, r.size))
@@ -144,12 +144,12 @@ def _invert(
                 band[0, i] = max(width, 0.0)
                 band[1, i] = max(r[i] * (growth[3] * s) + growth[2] * s, -band[0, i])
         lowest, highest = max(least, v - step), min(most, v + step)
-        # between these lies the voltage of H, open where H was not asked yet
+        # bracket of the voltage of H
         below = pole * start + (1.0 - pole) * lowest
         above = pole * start + (1.0 - pole) * highest
         before, asked = np.inf, False
         for trial in range(TRIALS + 1):
-            # H moves with the plays, though the voltage does not
+            # plays that widen move H although the voltage stays
             if trial or grows:
                 if c.shape[0] == 0:
                     w, slope = _plays(u, band, q, memory, after)
@@ -168,7 +168,7 @@ def _invert(
                 below = max(below, min(u, above))
             else:
                 above = min(above, max(u, below))
-            # Newton's step, to an end where it leads beyond, to the middle where it is slow
+            # Newton step; clipped to the bracket, and replaced by bisection if it is slow
             new = u - f / slope
             if abs(f) > 0.5 * before and above - below < np.inf:
                 new = 0.5 * (below + above)
@@ -186,7 +186,7 @@ def _invert(
 
 class HysteresisInverse:
     """
-    The inverse of H with its memory, block by block, in normalised units.
+    Inverse of H with its memory, block by block, in normalised units.
 
     Parameters
     ----------
@@ -196,17 +196,17 @@ class HysteresisInverse:
     step : float, optional
         Largest change of the voltage from one sample to the next.
     pole : float, optional
-        Of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
+        Pole of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
     growth : array_like, shape (4,), optional
-        Of the plays with a power of the speed: of all, relative, and both of the upper edge, see
+        Growth of the plays with a power of the speed: gain, stretch, lead and lead_stretch of
         `rate_dependent_hysteresis`.
 
     Attributes
     ----------
     hysteresis : Hysteresis
-        H as it is inverted, see `rising`.
+        H that is inverted, see `rising`.
     limits : tuple of float
-        Those given, as far as H rises up to them.
+        The given limits, cut to the range in which H rises.
 
     Raises
     ------
@@ -241,14 +241,14 @@ class HysteresisInverse:
         self._memory = self._last = np.zeros(0)
 
     def reset(self, u0: float) -> float:
-        """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
+        """Come to rest at a voltage, with plays as after a stroke from the lowest voltage."""
         h = self.hysteresis
         w, memory = h.follow(np.array([u0]), h.initial_memory(u0))
         self._take(memory, np.array([u0, w[0], 1.0, u0]))
         return float(w[0])
 
     def follow(self, u: Array) -> None:
-        """Take the plays along under voltages that something else applied, shape (n,)."""
+        """Follow voltages that another source has applied, shape (n,)."""
         m, lanes = self.hysteresis.thresholds.size, self._parameters[0].size
         memory = np.concatenate([self._memory[:m], self._memory[lanes:]])
         w, memory = self.hysteresis.follow(u, memory)
@@ -266,10 +266,9 @@ class HysteresisInverse:
 
     def process(self, w: Array, power: Array | None = None) -> tuple[Array, Array]:
         """
-        Return the voltages under which H comes as near to w as they may, and what H is then.
+        Find the voltages for wanted values w of H, and the values of H that they reach.
 
-        All are of shape (n,).  With a `power` of the speed the plays grow; without it they keep
-        their widths.
+        All are of shape (n,).  The plays grow with a `power` of the speed, if it is given.
         """
         u, reached = np.empty(w.size), np.empty(w.size)
         _invert(
@@ -288,10 +287,10 @@ class HysteresisInverse:
 
 def rising(hysteresis: Hysteresis, volts: Callable[[float], float] = float) -> Hysteresis:
     """
-    Return an H that rises with the voltage, by as few of its narrowest plays as lines as it takes.
+    Replace as few of the narrowest plays by lines as make H rise with the voltage.
 
-    ModelError, with the voltage where it falls by `volts` of the normalised one, where no such
-    lines make it rise.
+    Raises ModelError if H falls all the same; `volts` converts the normalised voltage that the
+    message names.
     """
     low, high = hysteresis.span
     narrow = int(np.sum(hysteresis.thresholds <= NARROW * (high - low)))
@@ -310,7 +309,7 @@ def rising(hysteresis: Hysteresis, volts: Callable[[float], float] = float) -> H
 
 def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
     """
-    Return a model whose H rises with the voltage, and a warning where that is another H.
+    Replace H of a model by an H that rises with the voltage; a warning says if it differs.
 
     Raises
     ------
@@ -330,7 +329,7 @@ def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ..
 
 
 def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
-    """Return the limits, nearer where H falls before them, or a whole span is left behind."""
+    """Cut the limits to the range in which H rises, at most one span beyond the identified one."""
     least, most = hysteresis.span
     if not -np.inf < low < high < np.inf or least <= low < high <= most:
         return low, high
@@ -338,7 +337,7 @@ def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, flo
     v = np.linspace(least - width, most + width, FINE)
     w = hysteresis(np.concatenate([v, v[::-1]]))
     up, down = np.diff(w[:FINE]), -np.diff(w[FINE:])[::-1]
-    # and where all plays stand
+    # also directly after a turn, while all plays stand
     stands = hysteresis.slope_at_turns(v[1:]) <= 0.0
     falls = (up <= 0.0) | (down <= 0.0) | stands
     below, above = v[1:][falls & (v[1:] <= least)], v[:-1][falls & (v[:-1] >= most)]

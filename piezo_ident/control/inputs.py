@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an inverse is asked for, checked: motion, limits, and further channels."""
+"""Check the inputs of an inverse: motion, limits and further channels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from piezo_ident.model.stage_model import StageModel
 
 
 def checked_motion(wanted: ArrayLike) -> Array:
-    """Return a wanted motion as a vector, or raise DataError."""
+    """Convert a wanted motion to a vector, or raise DataError."""
     y = _vector(wanted)
     if y.size < 2 or not np.all(np.isfinite(y)):
         raise DataError(
@@ -26,7 +26,7 @@ def checked_motion(wanted: ArrayLike) -> Array:
 
 
 def _vector(values: ArrayLike) -> Array:
-    """Return numbers as a vector, an empty one where they are none; NaN where masked."""
+    """Convert values to a vector: empty if they are no numbers, NaN where they are masked."""
     try:
         given: Any = np.ma.asarray(values)
         if given.ndim == 1 and np.isrealobj(given):
@@ -40,9 +40,9 @@ def checked_limits(
     model: StageModel, limits: tuple[float, float] | None, slew: float
 ) -> tuple[float, float, float]:
     """
-    Return lowest and highest voltage and its speed as numbers, or raise DataError.
+    Convert limits and slew to lowest voltage, highest voltage and speed, or raise DataError.
 
-    None stands for the identified range.
+    Limits of None stand for the identified range.
     """
     given = model.scaling.range if limits is None else limits
     try:
@@ -55,7 +55,7 @@ def checked_limits(
 
 
 def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -> dict[str, Array]:
-    """Return the further signals as long as the voltage is; DataError where one does not fit."""
+    """Extend further signals to the length of the voltage; DataError if a length is wrong."""
     found = {name: _vector(z) for name, z in channels.items()}
     for name, z in found.items():
         if z.shape != (n,) or not np.all(np.isfinite(z)):

@@ -2,22 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The voltage under which a model moves as wanted.
+Invert a model: find the voltage that moves it along a wanted displacement.
 
-The inverse of G and of H come one after the other; what effects and the edges of a filter leave is
-then made up for by a fixed-point iteration,
+The inverse of G (`linear_inverse`) and the inverse of H (`hysteresis_inverse`) give a first
+voltage.  Effects such as creep or a nonlinear sensor leave an error, which a fixed-point iteration
+removes,
 
     w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
 
-with y(u) the whole model in free run, and shorter steps where one leads away.  It converges as
-long as what is left out is small beside the stage, which creep, rate dependence and a bent sensor
-are; the result says how far it came.  The lag of an amplifier has an inverse of its own.
+where Q is the inverse of G and y(u) is the free run of the whole model.  A step that increases the
+error is halved.  The iteration converges if the effects are small beside the stage.  An amplifier
+lag before H is inverted together with H.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +29,7 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.control.expectation import expect, known_rms
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
 from piezo_ident.control.inputs import checked_limits, checked_motion, padded
-from piezo_ident.control.linear_inverse import linear_inverse
+from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
@@ -36,65 +38,63 @@ from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import brentq
 
-#: passes of the iteration, at most
+#: most passes of the iteration
 PASSES = 30
-#: error [of the span of the wanted motion, rms] below which it ends
+#: rms error [of the span of the wanted motion] at which the iteration ends
 EXACT = 1e-5
-#: share of the error that a pass must leave at most for another one
+#: the iteration goes on while a pass leaves at most this share of the error
 WORTH = 0.9
-#: least share of a step that is tried
+#: smallest share of a step that is tried
 SHORTEST = 0.2
-#: difference from the wanted motion that counts as a miss, as a share of its span, and the largest
-#: span of which it is a share, in spans of the model
+#: error that counts as a miss, as a share of the span of the motion; spans above the second number
+#: [spans of the model] count as that number
 MATTERS, LARGE = 1e-3, 0.1
-#: span of a motion that stands still, normalised
+#: span of a constant motion, normalised
 STANDS = 1e-9
-#: difference from what is wanted at rest, normalised, from which it is out of reach
+#: error at rest, normalised, above which a position is out of reach
 SHORT = 1e-4
-#: the same, of its span, of a model that errs by more elsewhere
+#: largest excess over the limits that is accepted from a less accurate model [of the span]
 SLIGHT = 1e-2
-#: step of a motion from one sample to the next that is a jump [of its span]
+#: difference of two neighbouring samples that is a jump [of the span of the motion]
 JUMPS = 0.05
-#: changes of the voltage [of the span of the model] below which the lead may be cut off, the
-#: largest first, and how far that may move the motion [of its span]
+#: changes of the voltage [of the span of the model] below which the lead is cut off, largest
+#: first; the cut may move the motion by at most the last number [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
-#: spans of the model beyond which, and below which, a wrong unit is likelier than a motion
+#: motions larger or smaller than these spans of the model probably have a wrong unit
 FAR, FAINT = 30.0, 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Inverse(Showable):
     """
-    A voltage, and where it takes the model.
+    A voltage, and the displacement of the model under this voltage.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
-        Time [s] of the samples; below the start of the wanted motion where the voltage has to
-        begin before it.
+        Time [s].  The wanted motion begins at 0; the voltage may begin earlier.
     v : ndarray, shape (n,)
         Voltage [V].
     wanted, predicted : ndarray, shape (n,)
-        Wanted displacement, and that of the model under v [m].
+        Wanted displacement, and displacement of the model under v [m].
     lead : int
         Samples by which the voltage begins before the wanted motion.
     clipped : ndarray of bool, shape (n,)
-        Where the voltage stands at a limit and the wanted motion is not reached.
+        Samples at which a limit keeps the model from the wanted motion.
     passes : int
-        Runs of the model that were needed.
+        Free runs of the model that the iteration took.
     error : float
-        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: what the
-        inversion leaves; of the span of the model where the motion stands still.
+        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: the error of the
+        inversion alone.  For a constant motion the span of the model replaces the denominator.
     expected : float or None
-        What the stage will err by without the mean [%, as `error`], if that of the model is known,
-        as of its diagnosis or its identification: as many metres as on the kind of motion that
-        the model knows least, however small this one is; what lies above the lowest mode; and
-        what creeps on.
+        Error of the stage that the model lets expect, without its mean [% as `error`].  It adds
+        the error of the model on its worst kind of motion (from its diagnosis or identification),
+        the motion above the lowest mode, and late creep.  None if the model has no known error.
     expected_rms : float or None
-        The same [m].
+        The same in metres.
     expected_offset : float or None
-        The mean of what the stage will err by [m], where it waits for a second at the beginning
-        and goes on creeping; None for a model without creep.
+        Mean error of the stage through late creep, if it waits for one second at the beginning
+        [m].  None for a model without creep.
     warnings : tuple of str
 
     Examples
@@ -133,27 +133,27 @@ def invert(
     like: Inverse | None = None,
 ) -> Inverse:
     """
-    Return the voltage under which a model moves as wanted.
+    Find the voltage that moves a model along a wanted displacement.
 
     Parameters
     ----------
     model : StageModel
     wanted : array_like, shape (n,)
-        Displacement [m], sampled at the rate of the model.  Before and after it the stage rests,
-        at its beginning as one that came there from its lowest voltage in one stroke and has
-        settled: with creep, better begin where nothing creeps.
+        Displacement [m] at the sampling rate of the model.  The stage rests before and after the
+        motion.  It has reached the first position in one stroke from its lowest voltage, and has
+        settled there.  A stage with creep should begin where nothing creeps.
     limits : tuple of float, optional
-        Lowest and highest voltage [V]; the identified range when absent.
+        Lowest and highest voltage [V].  Default: the identified range.
     slew : float, optional
         Largest speed of the voltage [V/s].
     clip : bool, optional
-        Come as near as the limits allow, instead of refusing.
+        Come as near to the motion as the limits allow, instead of refusing it.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     sample_rate : float, optional
-        Of the wanted motion [Hz], where that is known: another one than the model's is refused.
+        Sampling rate of the wanted motion [Hz], to be checked against the rate of the model.
     like : Inverse, optional
-        Of nearly the same motion, to begin with where plays widen with speed.
+        Inverse of a similar motion.  The search begins there if plays widen with speed.
 
     Returns
     -------
@@ -183,116 +183,207 @@ def invert(
             f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
             f'{model.sample_rate:g} Hz; give the motion at that rate'
         )
-    s = model.scaling
-    low, high, slew = given = checked_limits(model, limits, slew)
-    ends = float(s.u(low)), float(s.u(high))
-    inverted, warnings_of_h = with_rising_hysteresis(model)
-    H, linear = _of_hysteresis(inverted, ends, slew / s.V / model.sample_rate)
-    Q = linear_inverse(linear, iterated=True)
-    low, high = map(s.v, H.limits)
-    if not low < high:
-        raise DataError(
-            f'invert: the limits lie beyond what the model holds for, {s.range[0]:g} .. '
-            f'{s.range[1]:g} V; give others'
-        )
-    u0 = _rest(model, y, H.limits, clip)
-    # the voltage moves before and after the motion
-    lead, tail = Q.ahead, Q.behind
-    x = np.pad(s.x(y), (lead, tail), mode='edge')
-    more = padded(channels or {}, y.size, (lead, tail))
-    if like is not None and isinstance(H, RateInverse):
-        H.begin_at(np.pad(s.u(like.v), (lead - like.lead, tail), mode='edge'))
-    t = (np.arange(x.size) - lead) / model.sample_rate
-    span = float(np.ptp(x))
-    span = span if span > STANDS else 1.0
-    small, near = MATTERS * min(span, LARGE), 2 * Q.reach + 1
-    free = np.ones(x.size, dtype=np.bool_)
-    w = H.reset(u0) + Q(x - x[0])
-    least, passes, share = np.inf, 0, 1.0
-    while passes < PASSES:
-        H.reset(u0)
-        u, reached = H.process(w)
-        e = x - s.x(model.stream().process(s.v0 + s.V * u, t, more))
-        short = np.abs(w - reached) > small
-        if passes == 0 and not short.all():
-            # what is out of reach must not hide whether the rest converges
-            within = ~maximum_filter1d(short, near)
-            free = within if within.any() else free
-        passes += 1
-        rms = float(np.sqrt(np.mean(e[free] ** 2))) / span
-        is_worth = rms < WORTH * least
-        if rms < least:
-            least, best = rms, (u, e, short, reached)
-        if rms < EXACT:
-            break
-        if not is_worth:
-            # a step that led away was too long, where much is left
-            share *= 0.5
-            if least < MATTERS or share < SHORTEST:
-                break
-        w = best[3] + share * Q(best[1])
-    u, e, short, _ = best
-    miss = maximum_filter1d(np.abs(e), near)
-    short &= miss > small
-    # what of the lead and the tail is at rest goes
-    for still in (*STILL, 0.0):
-        moves = np.flatnonzero(np.abs(u - u0) > still * min(span, 1.0))
-        first = min(lead, int(moves[0]) - 1 if moves.size else lead)
-        used = slice(max(first, 0), lead + y.size)
-        # nor by the last digit
-        v = np.clip(s.v0 + s.V * u[used], *given[:2])
-        beside = {name: z[used] for name, z in more.items()}
-        predicted = model.stream().process(v, t[used], beside)
-        if np.abs(x[used] - e[used] - s.x(predicted)).max() < RESTS * span:
-            break
-    e, t, short, miss = e[used], t[used], short[used], miss[used]
-    warnings = list(warnings_of_h)
-    if short.any():
-        most = abs(s.Y) * float(miss[short].max())
-        at_top = u[used][short] > 0.5 * sum(H.limits)
-        jumps = maximum_filter1d(np.abs(np.diff(x[used], append=x[-1])), near)[short]
-        remedy = ''
-        if jumps.max() > JUMPS * span:
-            remedy = '; the motion jumps there: round it over two periods of the lowest mode'
-        elif np.isinf(slew) and (at_top.all() or not at_top.any()):
-            remedy = f'; {_shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
-        text = _unreached(t[short], most, low, high, slew)
-        warnings.append(f'{text}{remedy}')
+    s, (low, high, slew) = model.scaling, checked_limits(model, limits, slew)
+    task, warnings_of_h = _task(model, y, (low, high, slew), clip, channels or {})
+    if like is not None and isinstance(task.H, RateInverse):
+        around = task.Q.ahead - like.lead, task.Q.behind
+        task.H.begin_at(np.pad(s.u(like.v), around, mode='edge'))
+    best, passes = _iterate(task)
+    used, v, predicted = _without_rest(task, best, y.size, (low, high))
+    lead = task.Q.ahead - used.start
+
+    warnings, missed = list(warnings_of_h), best.missed[used]
+    largest = maximum_filter1d(np.abs(best.error), task.near)[used]
+    missed = missed & (largest > task.small)
+    if missed.any():
+        most = abs(s.Y) * float(largest[missed].max())
+        warnings.append(_out_of_reach(task, best, used, missed, most, slew))
         if not clip and most > _tolerance(model, y):
             raise DataError('; '.join([*warnings, *_faint(model, y)]), options='--clip')
-    e = e[~maximum_filter1d(short, near)]
-    left = float(np.sqrt(np.mean(e**2))) / span if e.size else 0.0
+    error = best.error[used][~maximum_filter1d(missed, task.near)]
+    left = float(np.sqrt(np.mean(error**2))) / task.span if error.size else 0.0
     expected = expect(model, v, y)
-    relative = 0.0 if expected.rms is None else expected.rms / abs(s.Y) / span
+    relative = 0.0 if expected.rms is None else expected.rms / abs(s.Y) / task.span
     if left > max(MATTERS, relative):
         warnings.append(
             f'the drive misses {100 * left:.2g} % of the wanted motion within all limits: the '
             'motion is faster than the stage, or jumps, or no voltage makes up for an effect or a '
             'line'
         )
-    warnings += _extrapolated(model, v, y)
-    goal = np.pad(y, (lead, 0), mode='edge')[used]
-    lead -= used.start
+    span = task.span * abs(s.Y)
     return Inverse(
-        t=t,
+        t=task.t[used],
         v=v,
-        wanted=goal,
+        wanted=np.pad(y, (lead, 0), mode='edge'),
         predicted=predicted,
         lead=lead,
-        clipped=short,
+        clipped=missed,
         passes=passes,
-        error=percent_of_stroke(y, predicted[lead:], span * abs(s.Y)),
-        expected=None if expected.rms is None else percent(expected.rms, span * abs(s.Y)),
+        error=percent_of_stroke(y, predicted[lead:], span),
+        expected=None if expected.rms is None else percent(expected.rms, span),
         expected_rms=expected.rms,
         expected_offset=expected.offset,
-        warnings=(*warnings, *expected.warnings),
+        warnings=(*warnings, *_extrapolated(model, v, y), *expected.warnings),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """
+    A wanted motion with rest before and after it, in which the voltage may already move.
+
+    Attributes
+    ----------
+    model : StageModel
+    H, Q : HysteresisInverse or RateInverse, and LinearInverse
+    rest : float
+        Normalised voltage at which the motion begins.
+    x, t : ndarray, shape (n,)
+        Wanted motion, normalised, and time [s].
+    channels : mapping of str to ndarray, shape (n,)
+    span, small : float
+        Span of the motion, and error that counts as a miss, both normalised.
+    """
+
+    model: StageModel
+    H: HysteresisInverse | RateInverse
+    Q: LinearInverse
+    rest: float
+    x: Array
+    t: Array
+    channels: Mapping[str, Array]
+    span: float
+    small: float
+
+    @property
+    def near(self) -> int:
+        """Width of the neighbourhood in which Q spreads an error [samples]."""
+        return 2 * self.Q.reach + 1
+
+
+class _Pass(NamedTuple):
+    """
+    One pass of the iteration, normalised; all of shape (n,).
+
+    Voltage, error of the model under it, samples whose H is out of reach, and H that was reached.
+    """
+
+    u: Array
+    error: Array
+    missed: Mask
+    reached: Array
+
+
+def _task(
+    model: StageModel,
+    y: Array,
+    bounds: tuple[float, float, float],
+    clip: bool,
+    channels: Mapping[str, ArrayLike],
+) -> tuple[_Task, tuple[str, ...]]:
+    """Prepare the inversion within bounds (lowest, highest voltage, slew); warnings about H."""
+    s, (low, high, slew) = model.scaling, bounds
+    inverted, warnings = with_rising_hysteresis(model)
+    ends = float(s.u(low)), float(s.u(high))
+    H, linear = _of_hysteresis(inverted, ends, slew / s.V / model.sample_rate)
+    Q = linear_inverse(linear, iterated=True)
+    if not s.v(H.limits[0]) < s.v(H.limits[1]):
+        raise DataError(
+            f'invert: the limits lie beyond what the model holds for, {s.range[0]:g} .. '
+            f'{s.range[1]:g} V; give others'
+        )
+    rest, around = _rest(model, y, H.limits, clip), (Q.ahead, Q.behind)
+    x = np.pad(s.x(y), around, mode='edge')
+    span = float(np.ptp(x)) if np.ptp(x) > STANDS else 1.0
+    task = _Task(
+        model,
+        H,
+        Q,
+        rest,
+        x,
+        (np.arange(x.size) - Q.ahead) / model.sample_rate,
+        padded(channels, y.size, around),
+        span,
+        MATTERS * min(span, LARGE),
+    )
+    return task, warnings
+
+
+def _iterate(task: _Task) -> tuple[_Pass, int]:
+    """Iterate until the error falls no more; the best pass, and the number of passes."""
+    s = task.model.scaling
+    counts = np.ones(task.x.size, dtype=np.bool_)
+    w = task.H.reset(task.rest) + task.Q(task.x - task.x[0])
+    least, passes, share = np.inf, 0, 1.0
+    while passes < PASSES:
+        task.H.reset(task.rest)
+        u, reached = task.H.process(w)
+        y = task.model.stream().process(s.v0 + s.V * u, task.t, task.channels)
+        now = _Pass(u, task.x - s.x(y), np.abs(w - reached) > task.small, reached)
+        if passes == 0 and not now.missed.all():
+            # a part out of reach must not hide the convergence of the rest
+            within = ~maximum_filter1d(now.missed, task.near)
+            counts = within if within.any() else counts
+        passes += 1
+        rms = float(np.sqrt(np.mean(now.error[counts] ** 2))) / task.span
+        falls_enough = rms < WORTH * least
+        if rms < least:
+            least, best = rms, now
+        if rms < EXACT:
+            break
+        if not falls_enough:
+            # a large error that grows comes from a step that was too long
+            share *= 0.5
+            if least < MATTERS or share < SHORTEST:
+                break
+        w = best.reached + share * task.Q(best.error)
+    return best, passes
+
+
+def _without_rest(
+    task: _Task, best: _Pass, size: int, limits: tuple[float, float]
+) -> tuple[slice, Array, Array]:
+    """Cut off the tail and the part of the lead at rest: samples, voltage and displacement."""
+    s, lead = task.model.scaling, task.Q.ahead
+    for still in (*STILL, 0.0):
+        moves = np.flatnonzero(np.abs(best.u - task.rest) > still * min(task.span, 1.0))
+        first = min(lead, int(moves[0]) - 1 if moves.size else lead)
+        used = slice(max(first, 0), lead + size)
+        # rounding must not cross a limit
+        v = np.clip(s.v0 + s.V * best.u[used], *limits)
+        channels = {name: z[used] for name, z in task.channels.items()}
+        predicted = task.model.stream().process(v, task.t[used], channels)
+        moved = task.x[used] - best.error[used] - s.x(predicted)
+        if np.abs(moved).max() < RESTS * task.span:
+            break
+    return used, v, predicted
+
+
+def _out_of_reach(
+    task: _Task, best: _Pass, used: slice, missed: Mask, most: float, slew: float
+) -> str:
+    """Say which samples the limits do not reach, by how much [m], and what to change."""
+    s, (low, high) = task.model.scaling, task.H.limits
+    x, t = task.x[used], task.t[used][missed]
+    at_top = best.u[used][missed] > 0.5 * (low + high)
+    jumps = maximum_filter1d(np.abs(np.diff(x, append=x[-1])), task.near)[missed]
+    remedy = ''
+    if jumps.max() > JUMPS * task.span:
+        remedy = '; the motion jumps there: round it over two periods of the lowest mode'
+    elif np.isinf(slew) and (at_top.all() or not at_top.any()):
+        remedy = f'; {_shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
+    speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'
+    return (
+        f'{t.size} samples of the wanted motion, between {t[0]:.4g} and {t[-1]:.4g} s, are out of '
+        f'reach within {s.v(low):g} .. {s.v(high):g} V{speed}: by up to {1e6 * most:.3g} um'
+        f'{remedy}'
     )
 
 
 def _of_hysteresis(
     model: StageModel, ends: tuple[float, float], step: float
 ) -> tuple[HysteresisInverse | RateInverse, StageModel]:
-    """Return the inverse of H, with what is done along with it, and the model of the rest."""
+    """Invert H with plays that widen or an amplifier lag; the model of the remaining parts."""
     h, rate, pole, linear = model.hysteresis, model.sample_rate, 0.0, model
     wide = [s for s in model.effects if s.name == RateDependentHysteresis.name]
     lag = [s for s in model.effects_in('input') if s.name == AmplifierLag.name]
@@ -307,7 +398,7 @@ def _of_hysteresis(
 
 
 def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
-    """Return the normalised voltage at which the model rests where a motion begins."""
+    """Find the normalised voltage at which the model rests at the first position."""
     s = model.scaling
     x0 = float(s.x(y[0]))
 
@@ -331,12 +422,12 @@ def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) 
 
 
 def _tolerance(model: StageModel, y: Array) -> float:
-    """Return by how much a motion may leave the limits: less than the stage errs by [m]."""
+    """Excess over the limits that is accepted: below the error of the model [m]."""
     return min(known_rms(model) or 0.0, SLIGHT * float(np.ptp(y)))
 
 
 def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
-    """Return a warning where the model is asked for what it was not identified for."""
+    """Warn of voltages outside the identified range, and of a motion that is very small."""
     s = model.scaling
     (low, high), warnings = s.range, []
     outside = np.mean((v < low - SHORT * s.V) | (v > high + SHORT * s.V))
@@ -349,7 +440,7 @@ def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
 
 
 def _faint(model: StageModel, y: Array) -> list[str]:
-    """Return a warning where a motion is so small that its unit is in doubt."""
+    """Warn of a motion so small that its unit is doubtful."""
     s = model.scaling
     if not 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
         return []
@@ -361,12 +452,3 @@ def _faint(model: StageModel, y: Array) -> list[str]:
 
 def _shifted(by: float) -> str:
     return f'{"raise" if by > 0.0 else "lower"} the motion by {1e6 * abs(by):.3g} um'
-
-
-def _unreached(t: Array, miss: float, low: float, high: float, slew: float) -> str:
-    """Return how much of a motion the limits do not reach, and where."""
-    speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'
-    return (
-        f'{t.size} samples of the wanted motion, between {t[0]:.4g} and {t[-1]:.4g} s, are out of '
-        f'reach within {low:g} .. {high:g} V{speed}: by up to {1e6 * miss:.3g} um'
-    )

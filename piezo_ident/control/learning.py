@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Iterative learning: the same motion again, corrected by what was measured before.
+Learn a repeated motion: correct each run by the measured error of the best run so far.
 
     r <- r + s F (y_wanted - y),        u = inverse model of r
 
-F is a low-pass without phase: where the model is not known, above the lowest mode that rings, a
-correction may do harm.  What repeats from run to run falls by the share to which the model is
-right; noise does not, so the best run is kept and learning ends where the error falls no more.
-After a run that was worse, the step s from the best one is half as large.  The mean alone is no
-reason for that: a stage that creeps moves it from run to run.  Where the error falls
-slowly, what is left lies above the corner of F, which then grows until it harms.
+F is a low-pass without phase.  It protects the stage above the lowest mode that rings, where the
+model is uncertain and a correction may do harm.  The repeatable error falls from run to run;
+noise stays.  Learning therefore keeps the best run, and ends when the error falls no more.  A
+worse run halves the step s.  A change of the mean alone does not, because creep moves the mean
+from run to run.  If the error falls slowly, it lies above the corner of F, and the corner grows
+until a run becomes worse.
 D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
 Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 """
@@ -34,15 +34,15 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.faults import MAX_WILD
 from piezo_ident.record.jumps import least_step, wild_readings
 
-#: share of the error that a run must leave at most for another one
+#: learning goes on while a run leaves at most this share of the error
 WORTH = 0.95
-#: step below which a correction that harms is not tried again
+#: smallest step that is tried after a worse run
 SMALLEST = 0.2
-#: correlation of measured and predicted displacement below which that is not of the stage
+#: lowest correlation of measured and predicted displacement at which both are one stage
 WITH = 0.5
-#: corner of F, in parts of the lowest mode that rings, and of the sampling rate
+#: corner of F, as shares of the lowest mode that rings and of the sampling rate
 OF_MODE, OF_RATE = 0.7, 0.1
-#: share of the error that a run leaves where the corner holds it up, and by what it then grows
+#: a run that leaves more than this share is limited by the corner, which grows by this factor
 SLOW, WIDER = 0.5, 2.0
 
 
@@ -51,8 +51,8 @@ class Repetition:
     """
     One run of a motion.
 
-    `measured` is the displacement under `drive` [m], shape (n,), and `error` is 100 rms(wanted -
-    measured) / (max wanted - min wanted) of what the limits reach.
+    `measured` is the displacement under `drive` [m], shape (n,).  `error` is 100 rms(wanted -
+    measured) / (max wanted - min wanted) over the samples that the limits reach.
     """
 
     drive: Inverse
@@ -62,7 +62,7 @@ class Repetition:
 
 class Learning:
     """
-    A motion that is repeated and learned.
+    A repeated motion, learned from run to run.
 
     Parameters
     ----------
@@ -70,22 +70,22 @@ class Learning:
     wanted : array_like, shape (n,)
         Displacement [m].
     limits : tuple of float, optional
-        Lowest and highest voltage [V]; the identified range when absent.
+        Lowest and highest voltage [V].  Default: the identified range.
     slew : float, optional
         Largest speed of the voltage [V/s].
     clip : bool, optional
-        Come as near as the limits allow, instead of refusing; what they do not reach is not
-        learned, nor does it count.
+        Come as near to the motion as the limits allow, instead of refusing it.  Samples out of
+        reach are neither learned nor counted.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     corner : float, optional
-        Of F [Hz]; when absent, it begins below the lowest mode of the model and grows where the
-        error falls slowly.
+        Corner of F [Hz].  Default: it begins below the lowest mode of the model and grows while
+        the error falls slowly.
 
     Attributes
     ----------
     drive : Inverse
-        What to play next; `wanted` of it is the motion as it was corrected.
+        The next voltage to play; its `wanted` is the corrected motion.
     repetitions : list of Repetition
         So far.
 
@@ -121,7 +121,7 @@ class Learning:
         channels: Mapping[str, ArrayLike] | None = None,
         corner: float | None = None,
     ) -> None:
-        # near a limit a correction may reach beyond
+        # a correction may go beyond a limit although the motion does not
         self._invert = partial(
             invert, model, limits=limits, slew=slew, clip=True, channels=channels
         )
@@ -153,20 +153,20 @@ class Learning:
 
     @property
     def is_done(self) -> bool:
-        """Whether the error falls no more."""
+        """Return whether the error falls no more."""
         errors, shapes = [r.error for r in self.repetitions], self._shapes
         if len(errors) < 2 or errors[-1] <= WORTH * min(errors[:-1]):
             return False
         harms = errors[-1] > min(errors[:-1]) / WORTH
-        # after a harm a smaller step may still help, and the mean where the rest still falls
+        # after a worse run a smaller step may help; a moving mean does not end learning
         falls = shapes[-1] <= WORTH * min(shapes[:-1]) and shapes[-1] > 0.0
         return not (harms or falls) or self._step < SMALLEST
 
     def take(self, measured: ArrayLike) -> float:
         """
-        Take what was measured under `drive`, correct it, and return the error [% of stroke].
+        Learn from the displacement measured under `drive`, and return its error [% of stroke].
 
-        Few wild readings are bridged by a straight line.
+        A straight line bridges a few wild readings.
 
         Parameters
         ----------
@@ -199,17 +199,17 @@ class Learning:
             raise DataError(f'learning: {doubt}')
         error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
-        # the mean of a stage that creeps goes on from run to run: no harm of the correction
+        # creep moves the mean from run to run; the correction is not to blame
         shape, before = percent(float(np.std(e[self._counts])), self._span), self._shapes
         self._shapes = [*before, shape]
         if error <= self.best.error or shape <= min(before):
-            # what is out of reach would grow from run to run
+            # an error out of reach would grow from run to run
             self._missed = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
             self._best_reference, self._best_drive = self._reference, drive
             self._is_wider = self._may_widen and bool(before) and shape > SLOW * min(before)
             self._is_wider &= WIDER * self.corner <= OF_RATE * self._rate
             if self._is_wider:
-                # what is left lies above the corner
+                # the remaining error lies above the corner
                 self.corner *= WIDER
         elif self._is_wider:
             self.corner /= WIDER
@@ -218,25 +218,25 @@ class Learning:
             self._step *= 0.5
         correction = smoothed(self._missed, self.corner, self._rate)
         self._reference = self._best_reference + self._step * correction
-        # no other voltage of the same motion: another one errs elsewhere
+        # another voltage of the same motion would err elsewhere
         self.drive = self._invert(self._reference, like=self._best_drive)
         return error
 
     def _doubts(self, y: Array) -> Iterator[str]:
-        """Yield why measured displacement cannot be that of the stage under the drive."""
+        """Yield reasons why a displacement was not measured on this stage under the drive."""
         if not np.ptp(y) and np.ptp(self.drive.v):
             yield 'the displacement stands still; is the sensor connected?'
         if self.repetitions:
-            # a drive that has learned moves the model by what the stage does not do
+            # a learned drive moves the model away from the stage
             return
         pieces = [(y, self.drive.predicted)]
         yield from doubts(pieces, self._model_span)
-        # another axis does not run against the model, but not with it, either
+        # the displacement of another axis is neither opposed to the model nor like it
         if runs_against(pieces, self._model_span, below=WITH):
             yield REVERSED
 
 
 def _bridged(e: Array, stroke: float, y: Array) -> Array:
-    """Return an error without wild readings: what is learned of one would be played."""
+    """Remove wild readings from an error, since the next run would play them."""
     wild = wild_readings(e, stroke, least_step(y), y)
     return e if wild.mean() > MAX_WILD else interpolated(e, wild)

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The voltage under which a model moves as wanted, block by block while the motion comes in.
+Invert a model block by block while the wanted motion comes in.
 
-The offline inverse repeats one pass over the whole motion,
+The offline inverse repeats a pass over the whole motion,
 
     w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
 
-and Q looks ahead by a few samples alone.  So pass after pass may run behind the one before it by
-as many samples: each has its own H^-1 and its own model, which run once over every sample, and
-nothing is done twice.  That is the offline iteration, sample by sample, but for the ends of Q that
-do not fit into the preview; what they cost is tried out beforehand and reported.
+where Q looks ahead by a few samples.  Live, each pass runs that many samples behind the pass
+before it.  Each pass has its own H^-1 and its own model, and handles every sample once.  The
+result is the offline iteration, except that the ends of Q are cut to fit into the preview.  A
+trial motion measures the error of this cut beforehand.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from piezo_ident.control.linear_inverse import (
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 
-#: samples that a wanted motion is known ahead
+#: default preview [samples]
 PREVIEW = 400
-#: passes that are tried
+#: most passes
 MOST_PASSES = 4
-#: share of the error that one more pass must leave at most
+#: a further pass must leave at most this share of the error
 WORTH = 0.7
-#: samples in which the step fades that is left where another voltage ends
+#: duration of the transition from another voltage [samples]; taste
 JOIN = 2000
-#: error of the trial [% of stroke] from which the preview is called short
+#: error of the trial above which a warning calls the preview short [% of stroke]
 LARGE = 0.1
 #: trial motion: its samples; periods [samples] and amplitudes [of the range] of its sines
 TRIAL, SINES = 6000, ((2000.0, 0.3), (400.0, 0.08))
@@ -51,14 +51,14 @@ TRIAL, SINES = 6000, ((2000.0, 0.3), (400.0, 0.08))
 
 class Driven(NamedTuple):
     """
-    What leaves for a block of a wanted motion.
+    The voltage for a block of a wanted motion.
 
     Attributes
     ----------
     v : ndarray, shape (n,)
         Voltage [V].
     clipped : ndarray of bool, shape (n,)
-        Where a limit keeps the voltage from what the motion wants.
+        Samples at which a limit keeps the model from the wanted motion.
     """
 
     v: Array
@@ -69,29 +69,29 @@ class LiveInverse:
     """
     The inverse of a model, block by block.
 
-    The stage rests at `rest` before the first block, and the wanted motion with it, at `position`.
-    Each sample of a wanted motion gives one of voltage; the stage is there `preview` samples
-    later.
+    Before the first block the stage rests under the voltage `rest`, and the wanted motion rests
+    at `position`.  Each sample of wanted motion gives one sample of voltage.  The stage reaches
+    the wanted displacement `preview` samples later.
 
     Parameters
     ----------
     model : StageModel
     limits : tuple of float, optional
-        Lowest and highest voltage [V]; the identified range when absent.
+        Lowest and highest voltage [V].  Default: the identified range.
     slew : float, optional
         Largest speed of the voltage [V/s].
     preview : int, optional
-        Samples that the wanted motion is known ahead.
+        Samples by which the wanted motion is known ahead.
     rest : float, optional
-        Voltage before the first block [V]; the lower limit when absent.
+        Voltage before the first block [V].  Default: the lower limit.
 
     Attributes
     ----------
     preview, passes : int
-        Samples ahead, and passes that share them.
+        Samples ahead, and number of passes that share them.
     error : float
-        100 rms(wanted - reached) / (max wanted - min wanted) [%] of the model itself on a trial
-        motion of two slow sines: what the finite preview and the passes leave.
+        100 rms(wanted - reached) / (max wanted - min wanted) of the model on a trial motion of
+        two slow sines [%]: the error through the finite preview and number of passes.
     position : float
         Displacement of the stage at rest [m].
     warnings : tuple of str
@@ -142,7 +142,7 @@ class LiveInverse:
             self.warnings += (
                 f'a preview of {preview} samples in {self.passes} passes leaves '
                 f'{self.error:.2g} % of stroke on a slow motion, were the model exact'
-                # no preview makes up for a line
+                # a longer preview does not help plays that are inverted as lines
                 + remedy
                 * (not lines),
             )
@@ -150,7 +150,7 @@ class LiveInverse:
         self.reset()
 
     def _built(self, passes: int, slew: float) -> list[_Pass]:
-        """Return passes that share the preview."""
+        """Build passes that share the preview."""
         s, rate = self.model.scaling, self.model.sample_rate
         bounds = float(s.u(self._limits[0])), float(s.u(self._limits[1]))
         Q = self._filter.shortened(self.preview // passes)
@@ -168,7 +168,7 @@ class LiveInverse:
         ]
 
     def _tried(self) -> tuple[int, float]:
-        """Return the number of passes that is best on a trial motion, and the error it leaves."""
+        """Choose the number of passes on a trial motion; the number and its error."""
         stream = self.model.stream()
         low, high, rest = (stream.reset(v) for v in (*self._limits, self._rest))
         k = np.arange(TRIAL)
@@ -194,7 +194,7 @@ class LiveInverse:
 
     def recall(self, v: Array, t: Array) -> None:
         """
-        Bring amplifier and plays into their state after a past voltage; the rest is at rest.
+        Bring amplifier and plays into their state after a past voltage; G rests.
 
         Parameters
         ----------
@@ -206,10 +206,10 @@ class LiveInverse:
 
     def follow(self, v: Array, tick: int = 0) -> None:
         """
-        Take the model along under a voltage that something else applied, up to now.
+        Follow a voltage that another source has applied up to now.
 
-        The wanted motion is then taken to have been what the model makes of that voltage, and is
-        `position` now.  The first `preview` samples that come next give no voltage yet.
+        The displacement of the model under this voltage replaces the past of the wanted motion;
+        `position` is its last value.  The next `preview` samples give no voltage yet.
 
         Parameters
         ----------
@@ -224,7 +224,7 @@ class LiveInverse:
 
     def process(self, wanted: ArrayLike) -> Driven:
         """
-        Return the voltage for the next samples of a wanted motion.
+        Compute the voltage for the next samples of a wanted motion.
 
         Parameters
         ----------
@@ -234,7 +234,7 @@ class LiveInverse:
         Returns
         -------
         Driven
-            Of as many samples; after `follow`, of `preview` fewer.
+            As many samples; after `follow`, `preview` samples fewer.
 
         Raises
         ------
@@ -256,9 +256,9 @@ class LiveInverse:
 
 class _Pass:
     """
-    One pass of the iteration: its filter, its H^-1 and its model, a little behind the one before.
+    One pass of the iteration with its own filter, H^-1 and model, behind the pass before it.
 
-    It holds back `wait` samples for nothing; `left` passes come after it.
+    It waits for `wait` samples more than it needs; `left` passes come after it.
     """
 
     def __init__(
@@ -274,7 +274,7 @@ class _Pass:
         self._taps = Q.taps[::-1].copy()
         self._ahead, self._behind = Q.ahead + wait, Q.behind
         self._later, self._is_first, self._is_last = left * Q.ahead, is_first, left == 0
-        # H when something else let go of it, and how the step from there fades
+        # H at the end of another voltage, and the transition from there
         self._w0: float | None = None
         self._step, self._since = 0.0, JOIN
 
@@ -283,7 +283,7 @@ class _Pass:
         s, u0 = self._model.scaling, float(self._model.scaling.u(v0))
         w0, y0 = self._H.reset(u0), self._stream.reset(v0)
         x0 = float(s.x(y0))
-        # a bent sensor, say, makes of the rest of the chain more than a gain
+        # a nonlinear sensor makes the rest of the chain more than a gain
         self.origin = w0 - x0 * float(self._taps.sum())
         self._tick, self._w0, self._since = self._later, None, JOIN
         n, is_first = self._ahead, self._is_first
@@ -292,18 +292,18 @@ class _Pass:
         return y0
 
     def recall(self, v: Array, t: Array) -> None:
-        """Take the plays through a past voltage."""
+        """Bring the plays into their state after a past voltage."""
         u = self._model.scaling.u(v)
         self._H.reset(float(u[0]))
         self._H.follow(u)
         self._stream.recall(v, t)
 
     def follow(self, v: Array, tick: int) -> Array:
-        """Take the model along under a voltage, and return its displacement [m]."""
+        """Follow a voltage, and return the displacement of the model [m]."""
         s = self._model.scaling
         self._H.follow(s.u(v))
         y = self._run(v, tick)
-        # nothing of a wanted motion is known any more
+        # the wanted motion that was known ahead no longer holds
         self._x = self._w = np.empty(0)
         self._w0 = self._H.value
         past = self._d[: self._behind]
@@ -312,11 +312,11 @@ class _Pass:
 
     def process(self, x: Array, d: Array, w: Array) -> tuple[Array, Array, Array, Array, Mask]:
         """
-        Return what the next pass works on, of as many samples as are known far enough ahead.
+        Process the samples that are known far enough ahead, and return the input of the next pass.
 
-        x, d and w, shape (n,), are the wanted motion, what of it is missing, and H so far,
-        normalised.  The result are the same after this pass, the voltage u, normalised, and where
-        H could not become what it should; all of shape (m,).
+        x, d and w, shape (n,), are wanted motion, error and H before this pass, normalised.  The
+        result is x, d and w after this pass, the normalised voltage u, and the samples at which
+        H could not reach its goal; all of shape (m,).
         """
         x, d, w = (np.append(*z) for z in ((self._x, x), (self._d, d), (self._w, w)))
         n = max(x.size - self._ahead, 0)
@@ -333,7 +333,7 @@ class _Pass:
         return x, d, reached, u, np.abs(goal - reached) > SHORT
 
     def _joined(self, goal: Array) -> Array:
-        """Return what H should be, without a step behind a voltage that something else applied."""
+        """Fade the step from another voltage out of the goal of H."""
         if self._w0 is not None:
             slope = goal[1] - goal[0] if goal.size > 1 else 0.0
             self._step, self._w0, self._since = self._w0 + slope - goal[0], None, 0
@@ -349,7 +349,7 @@ class _Pass:
 
 
 def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
-    """Return a model without effects of further channels, which have no preview."""
+    """Remove effects of further channels, which have no preview; warnings name them."""
     left = [setting for setting in model.effects if setting.channel]
     if not left:
         return model, ()

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The inverse of H with plays that widen with speed.
+Invert H with plays that widen with speed.
 
-With known thresholds each sample is the root of one unknown, as for H alone.  The thresholds
-follow from the speed of the voltage that is sought: it is that of the voltage found before,
-smoothed.  To solve for both at once would be exact and of no use: a faster voltage widens the
-plays by more than it moves them, so the root jumps from sample to sample.
+With known thresholds each sample is a root in one unknown, as for H alone.  The thresholds depend
+on the speed of the unknown voltage.  A pass takes the speed of the voltage that the pass before
+found, smoothed.  An exact solution for voltage and speed together is useless: a faster voltage
+widens the plays by more than it moves them, so the root jumps from sample to sample.
 
-Where plays widen much, that does not settle: the voltage has to begin before a turn to make up for
-it, as before a zero outside the unit circle.  There the whole voltage is corrected at once by
-Gauss and Newton, in steps that are small, smooth and of least squares.
+The passes do not converge if plays widen much.  The voltage must then change before a turn, as
+before a zero outside the unit circle.  Gauss-Newton steps correct the whole voltage in this case;
+they are small, smooth and solved by least squares.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.sparse.linalg import LinearOperator, lsmr
 
-#: times that the speed is taken again, and the corner of its smoothing in cutoffs of the effect
+#: most passes, and corner of the smoothing of the speed in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
-#: share of the square of what a pass misses that it must leave at most for another one
+#: passes go on while one leaves at most this share of the squared error
 WORTH = 0.7
-#: what the passes may leave without a correction of the whole [of the span of the motion, rms]
+#: largest rms error of the passes without Gauss-Newton steps [of the span of the motion]
 SETTLED = 1e-4
-#: such corrections, of a motion, and of nearly the same again
+#: Gauss-Newton steps for a new motion, and for a motion similar to the one before
 STEPS, AGAIN = 12, 3
-#: corner of the correction in cutoffs of the effect, the weight of its size, and what it is
-#: solved to: share of the error, and products with the tangent
+#: a step: corner of its smoothing in cutoffs of the effect, weight of its size, relative
+#: tolerance, and most products with the tangent
 STEP_CORNER, STEP_SIZE, STEP_ERROR, PRODUCTS = 3.0, 1.0, 1e-3, 30
 
 
-#: what is left of the wanted motion, squared; the voltage; and H
+#: squared error, voltage, and H
 _Found = tuple[float, Array, Array]
 
 
@@ -55,7 +55,7 @@ class RateInverse:
     hysteresis : Hysteresis
         Without lags along the path.
     parameters : mapping
-        Of the effect.
+        Parameters of the effect.
     sample_rate : float
         [Hz]
     limits : tuple of float, optional
@@ -94,23 +94,23 @@ class RateInverse:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Those given, as far as H rises up to them."""
+        """The given limits, cut to the range in which H rises."""
         return self._inverse.limits
 
     def reset(self, u0: float) -> float:
-        """Come to rest at a voltage, the plays as of a stage that last came down to zero."""
+        """Come to rest at a voltage, with plays as after a stroke from the lowest voltage."""
         self._u0 = u0
         return self._inverse.reset(u0)
 
     def begin_at(self, u: Array) -> None:
-        """Take a voltage of nearly the same motion to begin with, shape (n,)."""
+        """Begin the next search at the voltage of a similar motion, shape (n,)."""
         self._before = u
 
     def process(self, w: Array) -> tuple[Array, Array]:
         """
-        Return the voltages of a whole motion w of H from rest, and what H is under them, nearly.
+        Find the voltage for a whole motion w of H from rest, and H under it (approximately).
 
-        All are of shape (n,).  H comes as near as the limits allow.
+        All are of shape (n,).  H comes as near to w as the limits allow.
         """
         best = self._passed(w)
         if best[0] > SETTLED**2 * w.size * float(np.ptp(w)) ** 2:
@@ -124,11 +124,11 @@ class RateInverse:
         return best[1:]
 
     def _passed(self, w: Array) -> _Found:
-        """Return the best of passes, each with the speed of the one before."""
+        """Repeat passes, each with the speed of the pass before; the best one."""
         u, reached = self._inverse.process(w)
         best, passes = (self._left(u, w), u, reached), PASSES
         if self._before.size == w.size:
-            # of nearly the same motion
+            # voltage of a similar motion
             u, passes = self._before, 1
         for _ in range(passes):
             power = self._effect.power(smoothed(u, *self._smoothing), self._u0)
@@ -142,7 +142,7 @@ class RateInverse:
         return best
 
     def _corrected(self, w: Array, u: Array, steps: int, best: _Found) -> _Found:
-        """Return the best of what was found and of what corrections make of a voltage."""
+        """Correct a voltage by Gauss-Newton steps; the best result, `best` included."""
         n = w.size
         for _ in range(steps):
             J = tangent(self._effect, u, self._u0)
@@ -155,13 +155,13 @@ class RateInverse:
                 btol=STEP_ERROR,
                 maxiter=PRODUCTS,
             )[0]
-            # one that led away may lead to a better place, so the next one goes on from it
+            # a step that increases the error may lead to a better region, so it is kept
             u = np.clip(u + self._smooth(change), *self.limits)
             best = min(best, self._found(u, w), key=lambda x: x[0])
         return best
 
     def _found(self, u: Array, w: Array) -> _Found:
-        """Return a voltage with what it misses, endlessly much where it is too steep."""
+        """Rate a voltage by its squared error, which is infinite if it is too steep."""
         if np.abs(np.diff(u, prepend=self._u0)).max() > self._step:
             return np.inf, u, w
         at_limit = (u <= self.limits[0]) | (u >= self.limits[1])
@@ -172,11 +172,11 @@ class RateInverse:
         return smoothed(x.ravel(), corner, rate)
 
     def _under(self, u: Array) -> Array:
-        """Return H with its own speed."""
+        """H under a voltage, with the speed of this voltage."""
         self._effect.reset(self._u0, self._u0)
         return self._effect.process(Block(t=np.zeros(u.size), v=u, x=u)).x
 
     def _left(self, u: Array, w: Array) -> float:
-        """Return by how much H with its own speed misses what is wanted, squared."""
+        """Squared error of H under a voltage, with the speed of this voltage."""
         e = self._under(u) - w
         return float(e @ e)

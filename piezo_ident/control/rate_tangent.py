@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a small change of the voltage makes of H with plays that widen with speed, and its transpose.
+Tangent of H with plays that widen with speed, and its transpose.
 
-A play at an edge of its band goes with the voltage and with the speed, which is that of a
-low-pass; one within its band keeps what was left to it.
+A play at an edge of its band follows the voltage and the low-passed speed.  A play within its band
+keeps its value.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from scipy.sparse.linalg import LinearOperator
 
 def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOperator:
     """
-    Return the changes of H with small changes of a voltage from rest at u0, as an operator.
+    Linearise H at a voltage u, shape (n,), that starts from rest at u0.
 
-    They are those at a voltage u, shape (n,).
+    The operator maps a small change of the voltage to the change of H.
     """
     h = effect.hysteresis
     r, q, p1, p2, p0, low, c = h.for_kernel
@@ -66,7 +66,7 @@ def _edges(
     weight: Array,
     line: Array,
 ) -> None:
-    """Write the edge at which each play is: -1, 1, or 0 for none; add what curves make."""
+    """Write the edge of each play (-1, 1, or 0 for none), and add the slopes of curves."""
     for k in range(u.size):
         x, s = u[k], power[k]
         for i in range(r.size):
