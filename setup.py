@@ -15,6 +15,11 @@ cluster = [
     'distributed>=2024.5',
 ]
 
+# transfer functions of python-control
+control = [
+    'control>=0.9.4,<0.11',
+]
+
 # the documentation site
 docs = [
     'myst-parser>=3,<6',
@@ -85,11 +90,13 @@ setup(
             'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
         ],
         'cluster': cluster,
+        'control': control,
         'docs': docs,
         'files': files,
         'fmu': fmu,
         'test': [
             *cluster,
+            *control,
             *docs,
             *files,
             *lint,
@@ -107,7 +114,7 @@ setup(
         # what the benchmarks set beside the package; all live with one numpy, 2.0 to 2.3
         'bench': [
             *cluster,
-            'control>=0.10,<0.11',
+            *control,
             'pyswarms>=1.3,<2',
             'pysindy>=2.1,<3',
             'sippy_unipi>=1.0.1,<2',

@@ -64,7 +64,7 @@ ROSDEP_KEYS = {
 PIP_ONLY = {'mcap', 'zstandard'}
 
 # Of the extras: imported only where somebody asks for what they do.
-OPTIONAL = {'distributed'}
+OPTIONAL = {'control', 'distributed'}
 
 # Runs in an interpreter of its own: imports the modules named as arguments with ROS out of reach,
 # prints which of them asked for it all the same.

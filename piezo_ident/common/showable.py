@@ -20,6 +20,12 @@ class Showable:
 
         return pi.report.plot(self)
 
+    def to_json(self: Any) -> dict[str, Any]:
+        """Convert it to plain data for strict JSON; see `piezo_ident.report.to_json`."""
+        import piezo_ident as pi
+
+        return pi.report.to_json(self)
+
     def __repr__(self: Any) -> str:
         import piezo_ident as pi
 

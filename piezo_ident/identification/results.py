@@ -16,6 +16,7 @@ from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import StepDelay
 from piezo_ident.identification.step2_dynamics import OrderTable
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
+from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
@@ -362,6 +363,11 @@ class Identification(Showable):
     settings: Settings
     records: tuple[Record, ...] = ()
     memories: Memories = field(default_factory=dict)
+
+    @property
+    def parameters(self) -> tuple[ModelParameter, ...]:
+        """All parameters of the model with their standard deviations."""
+        return self.model.parameters
 
     def error(self, data: str) -> float:
         """

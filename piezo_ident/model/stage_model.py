@@ -12,27 +12,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-import os
 from types import MappingProxyType
-from typing import Any, TYPE_CHECKING
+from typing import Any
 import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.common.files import write_text
 from piezo_ident.effects import find_effect
 from piezo_ident.effects.creep import Creep
+from piezo_ident.model.front_door import FrontDoor
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stream import Start, StartLike, Stream
 from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record.record import Piece, Record
-
-if TYPE_CHECKING:
-    from piezo_ident import Inverse
 
 #: share of the identified range below which a wrong unit is likelier than a small signal
 FAINT = 2e-3
@@ -65,7 +61,7 @@ class EffectSetting:
 
 
 @dataclass(frozen=True, eq=False)
-class StageModel:
+class StageModel(FrontDoor):
     """
     A stage: H, G, delay and effects, with its scaling and how it was identified.
 
@@ -261,25 +257,6 @@ class StageModel:
             warnings.warn(warning, stacklevel=2)
         return self.stream(start).follow(piece)
 
-    def inverse(self, wanted: ArrayLike, **options: Any) -> Inverse:
-        """
-        Return the voltage under which the model moves as wanted; see `piezo_ident.invert`.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import piezo_ident as pi
-        >>> model = pi.SimulatedStage.load('paper').model
-        >>> wanted = 20e-6 * (1.5 - np.cos(np.arange(2000) / 100))
-        >>> drive = model.inverse(wanted)
-        >>> y = model.simulate(drive.v)[drive.lead :]
-        >>> bool(np.abs(y - wanted).max() < 1e-7)
-        True
-        """
-        from piezo_ident import invert
-
-        return invert(self, wanted, **options)
-
     def stream(self, start: StartLike = None) -> Stream:
         """
         Return a run of this model that takes the voltage block by block.
@@ -313,26 +290,6 @@ class StageModel:
         """
         self.check_rate(piece)
         return self.stream(start).follow(piece)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """
-        Write the model file, in one piece: an old file stays whole until the new one is.
-
-        Raises
-        ------
-        DataError
-            When the file cannot be written.
-
-        Examples
-        --------
-        >>> import piezo_ident as pi
-        >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
-        >>> pi.load('model.yaml').delay.samples
-        3
-        """
-        from piezo_ident.model.files import model_to_yaml
-
-        write_text(path, model_to_yaml(self))
 
     def takes(self, piece: Piece) -> bool:
         """Return whether the model holds at the sampling rate of a piece."""

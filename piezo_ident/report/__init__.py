@@ -20,7 +20,7 @@ from piezo_ident.report.diagnosis import diagnosis_text
 from piezo_ident.report.folder import check_report_folder, write_report
 from piezo_ident.report.identification import headline, identification_text, table_one
 from piezo_ident.report.next_steps import next_steps, Prompt, Step
-from piezo_ident.report.picture import plot, save_plot, to_html, to_text
+from piezo_ident.report.picture import model_text, plot, save_plot, to_html, to_text
 from piezo_ident.report.refined import validated
 from piezo_ident.report.table import length
 from piezo_ident.report.to_json import json_text, steps_to_json, to_json
@@ -34,6 +34,7 @@ __all__ = [
     'identification_text',
     'json_text',
     'length',
+    'model_text',
     'next_steps',
     'plot',
     'save_plot',

@@ -15,7 +15,7 @@ from piezo_ident.common.files import temporary_output
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
-from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
@@ -24,6 +24,8 @@ from piezo_ident.report.table import length, number, plain_text, Table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from piezo_ident.control.inverse import Inverse
+    from piezo_ident.model.front_door import ModelParameter
+    from piezo_ident.model.stage_model import StageModel
 
     Result = Identification | Diagnosis | FreeRun | Inverse
 
@@ -115,6 +117,37 @@ def to_html(result: Result | Record) -> str:
     headline, table = _summary(result)
     picture = Shown('result', table.title, '', png(plot(result), DPI))
     return summary_html(headline, table, picture)
+
+
+def _value(p: ModelParameter) -> str:
+    value = p.value if isinstance(p.value, str) else f'{p.value:.4g}'
+    return f'{p.name} {value}' + f' {p.unit}' * (p.unit not in ('', '1', 'name'))
+
+
+def model_text(model: StageModel) -> str:
+    """Describe a model as text: range, hysteresis, dynamics, delay, effects and known errors."""
+    s, h, rate = model.scaling, model.hysteresis, model.sample_rate
+    low, high = s.range
+    lags = 0 if h.relaxations is None else len(h.relaxations)
+    parts = [f'{h.thresholds.size} plays', *[f'{lags} lags along the path'] * (lags > 0)]
+    parts += ['curves of their outputs'] * (h.curves is not None or h.bias is not None)
+    rows = [('voltage', f'{low:g} .. {high:g} V'), ('stroke', length(abs(s.Y)))]
+    rows += [('sampling rate', f'{rate:g} Hz'), ('hysteresis', ', '.join(parts))]
+    rows += [('static gain', f'{length(abs(float(model.bode(0.0).gain[0])))}/V')]
+    rows += [('order of G', f'na = {model.dynamics.a.size}, nb = {model.dynamics.b.size}')]
+    rows += [
+        ('mode', f'{number(mode.frequency, 4)} Hz, damping ratio {number(mode.damping)}')
+        for mode in model.dynamics.modes(rate)
+    ]
+    delay = model.total_delay.total
+    rows += [('delay', f'{delay:g} samples = {number(1e6 * delay / rate)} µs')]
+    for effect in model.effects:
+        own = [p for p in model.parameters if p.part == effect.name]
+        rows.append((effect.name, ', '.join(map(_value, own))))
+    error, worst = expected_error(model), worst_error(model)
+    known = 'unknown' if error is None else f'{number(error)}, at worst {number(worst)}'
+    rows += [('error', known + ' % of stroke' * (error is not None))]
+    return plain_text([Table('Model', ('', ''), rows, FORMULA)])
 
 
 def _summary(result: Result | Record) -> tuple[str, Table]:

@@ -11,7 +11,7 @@ from importlib import resources
 import json
 import math
 import sys
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from piezo_ident import __version__
@@ -19,22 +19,28 @@ from piezo_ident.diagnosis.results import Diagnosis, Errors, FORMULA, FoundParam
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Identification, Steps
 from piezo_ident.model import metrics
 from piezo_ident.model.files import finite, plain
-from piezo_ident.model.free_run import PieceRun
+from piezo_ident.model.free_run import FreeRun, PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
 from piezo_ident.report.identification import headline
 
+if TYPE_CHECKING:
+    from piezo_ident.control.inverse import Inverse
+
 VERSION = {'schema_version': 1, 'package_version': __version__}
 
 
-def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> dict[str, Any]:
+def to_json(
+    result: Identification | Diagnosis | FreeRun | Inverse | Record,
+    runs: Sequence[PieceRun] = (),
+) -> dict[str, Any]:
     """
-    Return a result as plain data, ready for strict JSON.
+    Convert a result to plain data, ready for strict JSON.
 
     Parameters
     ----------
-    result : Identification or Diagnosis
+    result : Identification, Diagnosis, FreeRun, Inverse or Record
     runs : sequence of PieceRun, optional
         For the steady-state errors of sines of an identification.
 
@@ -45,8 +51,56 @@ def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -
         finite is None; but a parameter of an effect that is infinite becomes the text ``inf`` or
         ``-inf``, and the overall error of a model that diverged the largest number there is.
     """
-    data = _diagnosis(result) if isinstance(result, Diagnosis) else _identified(result, runs)
+    if isinstance(result, Diagnosis):
+        data = _diagnosis(result)
+    elif isinstance(result, Identification):
+        data = _identified(result, runs)
+    else:
+        data = _numbers(result)
     return dict(finite(plain({**VERSION, **data})))
+
+
+def _numbers(result: FreeRun | Inverse | Record) -> dict[str, Any]:
+    """Numbers and texts of a result over time, without its samples."""
+    if isinstance(result, Record):
+        return {
+            'record': result.name,
+            'samples': result.n,
+            'duration': result.duration,
+            'sample_rates': list(dict.fromkeys(piece.sample_rate for piece in result)),
+            'voltage_range': list(result.voltage_range),
+            'stroke': result.stroke if result.is_measured else None,
+            'segments': list(result.labels),
+            'data_faults': _faults([result]),
+        }
+    if isinstance(result, FreeRun):
+        late = result.errors_after_start
+        return {
+            'record': result.record.name,
+            'errors': {
+                'unit': '% of stroke',
+                'formula': metrics.FORMULA,
+                'whole_record': asdict(result.errors),
+                'start_forgotten': None if late is None else asdict(late),
+            },
+            'estimated_starts': sum(result.estimated),
+            'warnings': list(result.warnings),
+        }
+    return {
+        'samples': result.v.size,
+        'lead': result.lead,
+        'voltage_range': [result.v.min(), result.v.max()],
+        'errors': {
+            'unit': '% of stroke',
+            'formula': metrics.FORMULA,
+            'inversion': result.error,
+            'expected': result.expected,
+            'expected_rms': result.expected_rms,
+            'expected_offset': result.expected_offset,
+        },
+        'out_of_reach': int(result.clipped.sum()),
+        'warnings': list(result.warnings),
+    }
 
 
 def json_text(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> str:
