@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Whether a delay holds in a free run over noise.
+Check a delay by free runs over noise.
 
-An answer that starts slowly, or noise that is not white, makes steps and the ARX loss tell too
-large a delay.  G makes up for a delay that is too small, and never for one that is too large.
+Steps and the ARX loss give too large a delay if the displacement starts slowly or the noise is not
+white.  A free run shows this: G can make up for a delay that is too small, but not for a delay
+that is too large.
 """
 
 from __future__ import annotations
@@ -23,32 +24,34 @@ from piezo_ident.identification.step2_dynamics import (
 
 Signals = tuple[Array, Array]
 
-#: orders (n, n), and delays below those that are asked about [samples], that are tried
+#: orders (n, n) that are tried, and delays [samples] that are tried below the delays in question
 ORDERS = (4, 8, 12)
 DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
-#: share of the least error within which another one is no larger
+#: errors within this share of the smallest error count as equal to it
 SLACK = 0.05
-#: share of the motion that the best free run may err where a delay is taken that nothing tells
+#: largest error of the best free run, as a share of the motion, at which it may decide the delay
+#: that neither steps nor scan tell
 FOLLOWS = 0.5
 
 
 def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
-    Return the delay of steps or of the scan that a free run upholds, else one that it allows.
+    Choose the delay of steps or of the scan that the free run supports, else another delay.
 
-    Of two that hold the smaller goes; where none does, half of the largest that does.  What has no
-    source stays so where the largest that is tried holds and none at all does not, or where that
-    holds and no model follows the noise.  `fitted` and `held` are input and output of noise, to
-    fit and right behind that to judge by.
+    A delay holds if its free run errs no more than the best.  The smaller of two delays that hold
+    is chosen.  If neither holds, half of the largest delay that holds is chosen.  A result without
+    source stays unchanged if the largest delay holds and a delay of 0 does not, or if no model
+    follows the noise.  `fitted` is input and output of noise, `held` the noise right behind it
+    that judges.
     """
-    # a delay of no source is but the largest that is tried
+    # a result without source holds only the largest delay of the scan
     told = found.samples if found.source != 'none' else None
     asked = [d for d in (told, found.scan) if d is not None]
     most = max(asked, default=found.samples)
     tried = sorted({*asked, most, *(d for d in DELAYS if d < most)})
     u, y = fitted
     factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
-    # what rings for long has died away where it is judged
+    # judge behind the fitted noise, so that long ringing has died away
     v, x = (np.concatenate(pair) for pair in zip(fitted, held, strict=True))
     errors = []
     for d in tried:
@@ -58,7 +61,7 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     least = min(errors)
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
     if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
-        # it may well be larger, or nothing follows the noise at all
+        # the delay may be larger, or no model follows the noise
         return found
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
     if samples == told:

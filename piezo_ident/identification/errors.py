@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of an identified model on the runs that it came from, and the noise floor below them."""
+"""Errors of an identified model on the runs of its fit, and the noise floor below them."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
-#: level of small motion from which loops drift, in parts of the rms that H leaves of the triangles
+#: smallest shift of small motion that counts as drift, relative to the rms error on the triangles
 ELSEWHERE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """
-    The free run of a model over a run, and of its hysteresis alone [m].
+    Free run of a model, and of its hysteresis alone, over a run [m].
 
-    Where the memory at the start is estimated, the samples that it is estimated from are no test:
-    they are not among `judged`.
+    If the memory at the start is estimated, the samples of the estimate are no test, so `judged`
+    leaves them out.
     """
 
     run: Run
@@ -44,7 +44,7 @@ class Prediction:
 
 
 def key_of(run: Run) -> tuple[str, float]:
-    """Return record and start time of a run [s]; a clock that restarts may give it to several."""
+    """Key of a run: record and start time [s]; runs after a clock restart may share a key."""
     return run.record, run.piece.start_time
 
 
@@ -54,7 +54,7 @@ def predictions_of(
     memories: Memories | None = None,
     offsets: Mapping[tuple[str, float], float] | None = None,
 ) -> list[Prediction]:
-    """Return the free run over each run; a memory at the start that is not given is estimated."""
+    """Simulate each run freely; a memory at the start that is not given is estimated."""
     static, found = model.without_dynamics(), []
     for run in runs:
         start: StartLike = (memories or {}).get(key_of(run))
@@ -64,7 +64,7 @@ def predictions_of(
             if start is not None:
                 late = early_part(model, run.piece, memory=start.memory is not None)
                 judged = judged & (np.arange(judged.size) >= late)
-        # a sensor may be set to zero between two records
+        # a sensor may have been zeroed between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
         y_hat, y_static = (m.predict_piece(run.piece, start) + zero for m in (model, static))
         found.append(Prediction(run, y_hat, y_static, judged))
@@ -75,10 +75,9 @@ def errors_of(
     predictions: Sequence[Prediction], masks: Sequence[tuple[Mask, Mask]]
 ) -> list[ErrorRow]:
     """
-    Return the free-run error of every segment, split into what was fitted and what was not.
+    Compute the free-run error of every segment, separately for each use of its samples.
 
-    The masks are for each run the samples that were fitted and those that only chose between
-    models.
+    The masks give for each run the fitted samples, and the samples that only chose between models.
     """
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
     rows = []
@@ -111,7 +110,7 @@ def errors_of(
 
 
 def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
-    """Return the noise floor that the residuals of all runs show."""
+    """Estimate the noise floor from the residuals of all runs."""
     parts = [
         ResidualPart(p.run.record, p.run.piece, p.run.piece.y - p.y_hat, p.run.use)
         for p in predictions
@@ -121,12 +120,11 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
 
 def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float, float]:
     """
-    Return what G and the delay leave of all fast motion beside a fine H, and all of it.
+    Compute the error on fast motion with a fine H, and the fast motion itself.
 
-    Both rms, in % of stroke.
-
-    A few plays miss small loops, and fast motion with them; a diagnosis fits a fine H of its own.
-    A zero that moved and what creeps are no part of it.
+    Both are rms values in % of stroke.  A few plays err on small loops, and thereby on fast
+    motion.  A diagnosis fits a fine H of its own, so this error uses a fine H, too.  A high-pass
+    removes a moved zero and creep.
     """
     if law == 'plays':
         excerpts = [run.excerpt(run.use) for run in runs]
@@ -150,10 +148,10 @@ def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float,
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
     """
-    Return the free-run errors of records that were given for validation.
+    Compute the free-run errors of records that were given for validation.
 
-    Readings that `without_faults` left out are not judged.  A record without a piece at the
-    sampling rate of the model raises IdentificationError.
+    Readings that `without_faults` removed do not count.  Raises IdentificationError if a record
+    has no piece at the sampling rate of the model.
     """
     rows: list[ErrorRow] = []
     for record in records:
@@ -170,17 +168,17 @@ def validation_errors(model: StageModel, records: Sequence[Record]) -> list[Erro
 
 
 def _residual(model: StageModel, run: Run) -> Array:
-    """Return what a model leaves of a run [m]."""
+    """Compute the free-run residual of a run [m]."""
     memory = run.start(model.hysteresis.thresholds)
     return run.piece.y - model.predict_piece(run.piece, memory)
 
 
 def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     """
-    Return whether small motion goes to another level than the triangles tell.
+    Tell whether small motion has another mean level than the triangles predict.
 
-    Small loops of a stage that is no sum of plays do not close: steps and noise drift towards the
-    middle of the large loop, and a triangle does not show it.
+    Small loops of a stage that is not a sum of plays do not close: steps and noise drift towards
+    the middle of the large loop.  A triangle does not show this drift.
     """
     for run in runs:
         e = _residual(model, run)
@@ -196,7 +194,7 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
 
 
 def squares_left(model: StageModel, runs: Sequence[Run]) -> float:
-    """Return the sum of squares that a model leaves of what chooses, offsets apart [m^2]."""
+    """Sum the squared residuals over the held-out samples, around the mean of each run [m^2]."""
     left = 0.0
     for run in runs:
         kept = run.held_out() & run.use

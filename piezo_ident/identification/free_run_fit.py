@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records without labelled segments: a list of starts, one free-run fit, one comparison.
+Identify records without labelled segments: a list of starts, one free-run fit, one comparison.
 
-The search works on `MOST` samples.  What it finds is fitted to all that is not held out, and
-judged by what is; in the end it is fitted to everything.  `make any-record` sets it beside peers.
+The search works on at most `MOST` samples.  Its result is fitted to all samples that are not held
+out, and judged by the held-out samples.  Finally it is fitted to all samples.  `make any-record`
+compares the result with other programs.
 """
 
 from __future__ import annotations
@@ -35,23 +36,24 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.suspicions import rises_first
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
-#: samples of records that the search simulates whole, those of windows of longer ones, and rows
-#: that the last fits count, at most (time: a search of windows takes half of a minute)
+#: most samples of records that the search simulates as a whole, most samples of the windows that
+#: it takes from longer records, and most rows of the final fits (time: a search of windows takes
+#: half a minute)
 MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
-#: blocks of all stretches together (taste: a fifth of them is held out in turn)
+#: number of blocks of all stretches together (taste: a fifth of the blocks is held out in turn)
 BLOCKS = 50
-#: plays of H, that at r = 0 included, where the user asks for no number
+#: number of plays of H, including the play at r = 0, unless the user sets it
 PLAYS = 40
-#: voltages for which H has to hold, normalised: a motion that is alike leaves the range by a
-#: little (taste: a seventh), and densities end with the span
+#: range of voltages of H, normalised: similar motion may leave the range slightly (taste: a
+#: seventh), and densities end with this span
 SPAN = (-0.15, 1.15)
-#: part of a window, one in so many, in which what began before it may ring (taste)
+#: the first 1/`RINGING` of a window is not fitted, as earlier motion may still ring there (taste)
 RINGING = 20
-#: elements of creep that are tried, over all times that a record holds (one a decade)
+#: number of elements of creep that are tried, spread over the times of a record (one a decade)
 ELEMENTS = 5
-#: shortest time constant of creep [s]: what is faster is dynamics
+#: shortest time constant of creep [s]: faster motion is dynamics
 FASTEST = 0.05
-#: steps of the fit to everything, from the fit to all that was not held out
+#: iterations of the fit to all samples, which starts at the fit without the held-out samples
 LAST = 5
 
 
@@ -64,7 +66,7 @@ def fit_free_run(
     Raises
     ------
     IdentificationError
-        When what is left to fit or to judge by is too short, or does not move.
+        If the fitted or the held-out samples are too few, or the voltage does not move in them.
     """
     chosen, parts = fitted_parts(runs, settings)
     _refuse_rest(chosen, parts)
@@ -74,7 +76,7 @@ def fit_free_run(
     best, found = search.best()
     progress('dynamics', 0.7)
     if settings.solver != 'swarm':
-        # the swarm looks for the weights of a sum of plays
+        # the swarm only finds the weights of a sum of plays
         found += tuple(search.wider(best, _taus(stretches)))
     best = search.at_rest(found)
     found += (best,)
@@ -103,7 +105,7 @@ def _refuse_rest(runs: Sequence[Run], parts: Sequence[Mask]) -> None:
 
 
 def _stretches(runs: Sequence[Run], parts: Sequence[Mask]) -> tuple[list[Stretch], Array]:
-    """Return runs as stretches, with blocks of one length, and the guess of each memory."""
+    """Turn runs into stretches with blocks of one length, and guess the memory of each."""
     size = max(1, sum(run.u.size for run in runs) // BLOCKS)
     stretches, guesses, count = [], np.full((len(runs), PARTS), UNKNOWN), 0
     for i, (run, mask) in enumerate(zip(runs, parts, strict=True)):
@@ -130,7 +132,7 @@ def _search(
     def tick() -> None:
         nonlocal steps
         steps += 1
-        # about a hundred steps
+        # a search takes about a hundred steps
         progress('dynamics', 0.7 * steps / (100.0 + steps))
 
     allowed = Allowed(settings.delay, settings.order, settings.max_order)
@@ -139,7 +141,7 @@ def _search(
 
 
 def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Return a few windows: of the widest motion, the fastest, and those in between."""
+    """Choose a few windows: of the widest motion, of the fastest motion, and between them."""
     size = WINDOWED // 3
     windows = []
     for s in stretches:
@@ -155,21 +157,21 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     found, count = [], 0
     for number, i in enumerate(sorted(chosen)):
         s, part = windows[i]
-        # windows are short: of finer blocks more can be held out
+        # windows are short: finer blocks allow more of them to be held out
         length = s.u[part].size
         block = np.arange(length) * (BLOCKS // 3) // length + count
         count += BLOCKS // 3
         use, before = s.use[part].copy(), np.empty(0)
         if part.start:
             before = remembered(s.u[: part.start + 1])
-            # what rings from before is not known
+            # ringing from before the window is unknown
             use[: length // RINGING] = False
         found.append(Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before))
     return found
 
 
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Return stretches of which at most `MOST_ROWS` samples count, whole pieces of each block."""
+    """Thin stretches to at most `MOST_ROWS` samples that count, in whole pieces of each block."""
     n = sum(int(s.use.sum()) for s in stretches)
     if n <= MOST_ROWS:
         return list(stretches)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the free-run fits of unlabelled records come to: model, starts, results, warnings."""
+"""Turn the free-run fits of unlabelled records into a model, starts, results and warnings."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ from piezo_ident.selection.comparison import Candidate, shown_effect
 @dataclass(frozen=True, eq=False)
 class FreeRunFits:
     """
-    What was fitted: to all but what is held out, then to everything.
+    Fits of unlabelled records: without the held-out samples, then to all samples.
 
     Attributes
     ----------
     chosen, parts : sequence
-        Runs that were fitted, and which samples of each were not held out.
+        Fitted runs, and the samples of each that were not held out.
     judged, last : Fit
     found : sequence of Candidate
-        What was compared.
+        Candidates that were compared.
     best : Candidate
-        What was chosen of it.
+        Candidate that was chosen.
     """
 
     chosen: Sequence[Run]
@@ -64,14 +64,14 @@ class FreeRunFits:
 def outcome_of(
     fits: FreeRunFits, runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings
 ) -> FitOutcome:
-    """Return model, results of the steps, starts and warnings."""
+    """Collect model, results of the steps, starts and warnings."""
     chosen, parts, last = fits.chosen, fits.parts, fits.last
     hysteresis = _hysteresis_result(fits, settings)
     model = _model(last.stage, hysteresis.hysteresis, rate, scaling, float(hysteresis.offsets[0]))
     tested = _model(fits.judged.stage, None, rate, scaling, float(fits.judged.stage.offsets[0]))
     low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
     keys = [key_of(run) for run in runs]
-    # where two have one name nobody could tell whose start it is
+    # two runs with the same key could not be told apart, so they keep no start
     own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
     stage, judged = last.stage, fits.judged.stage
     memories = {key: _start(stage, i, chosen[i], model) for key, i in own.items()}
@@ -123,7 +123,7 @@ def _model(
 
 
 def _compact(H: Hysteresis) -> Hysteresis:
-    """Return H without plays that weigh nothing."""
+    """Drop the plays without weight from H."""
     if H.curves is not None or H.bias is not None:
         return H
     used = H.weights > 0.0
@@ -131,7 +131,7 @@ def _compact(H: Hysteresis) -> Hysteresis:
 
 
 def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
-    """Return the start of a run in terms of the model."""
+    """Convert the start of a run to the elements of the model."""
     memory = _start_of(stage, i, run, model.hysteresis.thresholds)
     seen = stage.creep > 0.0
     if not seen.any():
@@ -140,7 +140,7 @@ def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
 
 
 def _start_of(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
-    """Return the play outputs at the start of a run."""
+    """Compute the play outputs at the start of a run."""
     widest = float(stage.law.thresholds[-1])
     return memory_of(float(run.u[0]), widest, stage.starts[i], thresholds)
 
@@ -176,7 +176,7 @@ def _hysteresis_result(fits: FreeRunFits, settings: Settings) -> HysteresisFit:
 
 
 def _swarm(stage: Stage, runs: Sequence[Run], settings: Settings) -> HysteresisFit:
-    """Return the weights that the swarm finds with G and the starts of the free-run fit."""
+    """Fit the weights by the swarm, with G and the starts of the free-run fit."""
     excerpts = []
     for i, run in enumerate(runs):
         excerpts.append(replace(run.excerpt(run.use), memory=partial(_start_of, stage, i, run)))
@@ -200,7 +200,7 @@ def _delay_result(fits: FreeRunFits, settings: Settings, rate: float, band: floa
         return DelayResult(settings.delay, float('inf'), 'given')
     if d == 0 and fits.last.stage.dynamics.is_static:
         return DelayResult(0, float('inf'), 'none')
-    # a drive that ends at f leaves a doubt of half a period of f
+    # a drive that ends at f leaves an uncertainty of half a period of f
     return DelayResult(d, max(1.0 / np.sqrt(12.0), 0.05 * rate / band), 'free run')
 
 
@@ -238,10 +238,10 @@ def _dynamics_result(fits: FreeRunFits, rate: float, band: float) -> DynamicsRes
 
 
 def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) -> dict[str, str]:
-    """Return what these data do not tell, and why."""
+    """Collect the quantities that the data do not tell, with reasons."""
     missing = {}
     if delay.source == 'none':
-        missing['delay'] = 'no delay errs less on held-out motion than none; add steps or noise'
+        missing['delay'] = 'no delay lowers the error on held-out motion; add steps or noise'
     if fits.last.stage.dynamics.is_static:
         missing['dynamics'] = (
             'no order of G errs clearly less on held-out motion than the hysteresis and a pure '
@@ -252,8 +252,8 @@ def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) ->
         reach = max(highest_frequency(run.u, rate) for run in fits.chosen)
         if reach < lowest:
             missing['dynamics'] = (
-                f'the voltage moves up to {reach:.3g} Hz, and the lowest mode of G lies at '
-                f'{lowest:.3g} Hz, where nothing was seen of it; add steps or noise'
+                f'the voltage moves up to {reach:.3g} Hz, below the lowest mode of G at '
+                f'{lowest:.3g} Hz, which the data therefore do not show; add steps or noise'
             )
     if reason := only_jumps(fits.chosen):
         missing['hysteresis'] = reason
@@ -261,20 +261,20 @@ def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) ->
 
 
 def _warn_of_creep(fits: FreeRunFits) -> list[str]:
-    """Say when a model with creep, too, errs less, but not by as much as an effect must."""
+    """Warn if creep lowers the error, but by less than an effect must."""
     more = shown_effect(fits.found, fits.best)
     if more is None:
         return []
     ours, theirs = (100.0 * float(np.sqrt(c.error)) for c in (fits.best, more))
     return [
         f'the stage may creep: with creep the model predicts parts of the data from the others to '
-        f' {theirs:.2g} % of stroke instead of {ours:.2g} %, too little to tell '
-        'creep from what H lacks; hold a voltage for some seconds behind a step'
+        f'{theirs:.2g} % of stroke instead of {ours:.2g} %, too small a difference to tell '
+        'creep from errors of H; hold a voltage for some seconds behind a step'
     ]
 
 
 def _named(run: Run, fitted: Mask) -> str:
-    """Return what is fitted of a run, in words."""
+    """Describe the fitted samples of a run."""
     held = true_runs(~fitted)
     rate = run.piece.sample_rate
     if len(held) == 1 and held[0][1] == fitted.size:

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The starts of a free-run fit: a straight line, H alone, G first, H first.
+Starts of a free-run fit: a straight line, H alone, G first, H first.
 
-Each is fitted by the one fit and compared by the one comparison, so the result predicts what was
-held out no worse than the best of them.  G comes from least squares at several orders and delays
-(ARX), once from the voltage and once from what H makes of it; the fit then moves H, G and the
+The same fit improves each start, and the same comparison judges all of them.  The result therefore
+predicts held-out samples as well as the best start.  Least squares (ARX) gives G at several orders
+and delays, once from the voltage and once from the output of H.  The fit then varies H, G and the
 memory at the start together.
 """
 
@@ -28,17 +28,17 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect
 from scipy.signal import butter, sosfilt
 
-#: orders na of G that are tried, with nb = na + 1, and those of the first rough fits
+#: orders na of G that are tried, with nb = na + 1, and the orders of the first rough fits
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
-#: laws of H that are tried beside sums of plays
+#: laws of H that are tried besides sums of plays
 WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
-#: share of the memory at a start of which nothing is known
+#: first guess of an unknown memory at a start: all shares in the middle
 UNKNOWN = 0.5
-#: steps of a rough fit and of a finished one
+#: iterations of a rough fit and of a final fit
 FEW, MANY = 6, 15
-#: share of the sampling rate above which least squares looks for modes that slow motion hides
+#: high-pass corner, as a share of the sampling rate, that uncovers modes which slow motion hides
 HIGH_PASS = 0.01
-#: delays of least one-step loss that are tried in free run, of each order
+#: number of delays of smallest one-step loss that are tried in free run, at each order
 NEAR = 3
 #: delays of H alone that are tried first [samples]
 COARSE = (0, 1, 2, 4, 8, 16, 32, 64)
@@ -46,7 +46,7 @@ COARSE = (0, 1, 2, 4, 8, 16, 32, 64)
 
 @dataclass(frozen=True)
 class Allowed:
-    """What a user has fixed: a delay [samples], an order (na, nb), the largest order."""
+    """Choices of the user: a delay [samples], an order (na, nb), the largest order."""
 
     delay: int | None = None
     order: tuple[int, int] | None = None
@@ -54,7 +54,7 @@ class Allowed:
 
     @property
     def is_free(self) -> bool:
-        """Whether neither delay nor order are fixed."""
+        """Whether neither delay nor order is fixed."""
         return self.delay is None and self.order is None
 
     @property
@@ -63,7 +63,7 @@ class Allowed:
         return range(MAX_DELAY) if self.delay is None else (self.delay,)
 
     def orders(self, of: Sequence[int]) -> list[tuple[int, int]]:
-        """Return the orders of a list that may be tried."""
+        """Select the orders of a list that may be tried."""
         if self.order is not None:
             return [self.order]
         return [(n, n + 1) for n in of if n <= self.largest]
@@ -73,12 +73,12 @@ def linear_starts(
     inputs: Sequence[Array], stretches: Sequence[Stretch], allowed: Allowed, of: Sequence[int]
 ) -> dict[tuple[int, int], tuple[int, Dynamics]]:
     """
-    Return for each order the delay and the G of least squares that err least in free run.
+    Find for each order the delay and the G of least squares with the smallest free-run error.
 
     Parameters
     ----------
     inputs : sequence of ndarray
-        What goes into G on each stretch, normalised.
+        Input of G on each stretch, normalised.
     stretches : sequence of Stretch
     allowed : Allowed
     of : sequence of int
@@ -91,7 +91,7 @@ def linear_starts(
     raw = [(w, s.x) for w, s in zip(inputs, stretches, strict=True)]
     for pairs in (
         [(w - w[0], x - x[0]) for w, x in raw],
-        # a start on the move is no rest
+        # a start in motion is not a state of rest
         [(w - w.mean(), x - x.mean()) for w, x in raw],
         [(sosfilt(sos, w - w[0]), sosfilt(sos, x - x[0])) for w, x in raw],
     ):
@@ -114,7 +114,7 @@ def _by_least_squares(
         for a, b in true_runs(s.use)
     ]
     found = []
-    # long orders leave short parts out, so each length has a factor of its own
+    # a long order leaves short parts out; use the largest order for which a part is long enough
     for most in sorted({na for na, _ in orders}, reverse=True):
         lags = max(nb for na, nb in orders if na <= most) + max(delays) + 1
         long = [(w, x) for w, x in parts if w.size > 3 * (most + lags)]
@@ -126,7 +126,7 @@ def _by_least_squares(
     for na, nb in orders:
         if na > most:
             continue
-        # the loss of one step names the delay; in free run its neighbours may do better
+        # the one-step loss points to the delay; a neighbour may have the smaller free-run error
         losses = {d: factor.fit(na, nb, d)[1] for d in delays}
         for d in sorted(losses, key=lambda d: losses[d])[:NEAR]:
             G = stabilised(factor.dynamics(na, nb, d))
@@ -138,7 +138,7 @@ def _by_least_squares(
 def _free_run_left(
     G: Dynamics, d: int, inputs: Sequence[Array], stretches: Sequence[Stretch]
 ) -> float:
-    """Return the sum of squares that G leaves, an offset taken out of each stretch."""
+    """Sum the squared free-run errors of G, around the mean of each stretch."""
     left = 0.0
     for w, s in zip(inputs, stretches, strict=True):
         e = (s.x - filter_arx(G.a, G.b, delayed(w, d)))[s.use]
@@ -150,20 +150,20 @@ def _free_run_left(
 @dataclass(frozen=True, eq=False)
 class Search:
     """
-    The search for H, G and the delay on a few stretches.
+    Search for H, G and the delay on a few stretches.
 
     Attributes
     ----------
     stretches : sequence of Stretch
     sets, kinds : ndarray of int, or None for `kinds`
-        Of each block, for the comparison.
+        Set and kind of motion of each block, for the comparison.
     law : HysteresisLaw
-        Plays alone.
+        Law of plays alone.
     guesses : ndarray, shape (records, PARTS)
-        First guess of the memory at the start of each record; zeros are known.
+        First guess of the memory at the start of each record; a row of zeros is a known start.
     allowed : Allowed
     tick : callable
-        Called between the steps; may raise to stop the work.
+        Called between the steps; it may raise to stop the work.
     """
 
     stretches: Sequence[Stretch]
@@ -176,9 +176,10 @@ class Search:
 
     def best(self) -> tuple[Candidate, tuple[Candidate, ...]]:
         """
-        Return the best candidate, and all.
+        Find the best candidate, and list all candidates.
 
-        No start is known where a free memory at those at rest takes what an effect must.
+        All starts count as unknown if a free memory at the starts at rest lowers the error by as
+        much as an effect must.
         """
         alone = self._hysteresis_alone()
         if self._starts_otherwise(self._candidate('hysteresis', alone)):
@@ -202,9 +203,9 @@ class Search:
 
     def at_rest(self, found: Sequence[Candidate]) -> Candidate:
         """
-        Return the best with its starts at rest again, if they are free and that errs no more.
+        Choose the best candidate with starts at rest, if free starts do not lower its error.
 
-        They were freed beside an H of plays; a wider one may need no memory from before.
+        The starts were freed with an H of plays.  A wider law may need no memory from before.
         """
         best = best_of(found)
         if np.array_equal(best.fit.stage.guesses, self.guesses):
@@ -231,7 +232,7 @@ class Search:
         return found + self._later(best_of(found))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
-        """Return the candidate with creep, those with wider laws of H, and with both."""
+        """Fit candidates with creep, with wider laws of H, and with both."""
         stage = best.fit.stage
         found = [self._more(best, 'creep', self._crept(stage, taus))]
         laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
@@ -248,7 +249,7 @@ class Search:
         return self._candidate(f'{best.name}, {name}', self._fit(stage, MANY), effects)
 
     def _crept_before(self, creeping: Sequence[Candidate]) -> list[Candidate]:
-        """Return the best with creep, begun with creep of earlier motion, where that errs less."""
+        """Add creep of earlier motion to the best candidate with creep, if it errs less."""
         known = min(creeping, key=lambda c: c.error)
         if not known.fit.stage.resting.any():
             return []
@@ -259,7 +260,7 @@ class Search:
         return [free] if ALIKE * free.error < known.error else []
 
     def _crept(self, stage: Stage, taus: Array) -> Stage:
-        """Return a stage with creep, that of a pole of G and the zero beside it taken out of G."""
+        """Add creep to a stage; remove a slow pole and its zero from G if creep replaces them."""
         crept, G = stage.with_creep(taus, self.stretches), stage.dynamics
         faster = G.without_slow_poles(1.0 / (2.0 * np.pi * taus[0]), self.stretches[0].rate)
         share = abs(G.gain / faster.gain - 1.0)
@@ -268,7 +269,7 @@ class Search:
         return replace(crept, dynamics=faster.normalised())
 
     def _later(self, best: Candidate) -> list[Candidate]:
-        """Return what a first coefficient of B less and a sample of delay more leave, in turn."""
+        """Drop the first coefficient of B for a sample of delay more, while the error falls."""
         found: list[Candidate] = []
         one = best
         while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:
@@ -293,7 +294,7 @@ class Search:
         return [stage.hysteresis(s.u, stage.memory(s)) for s in self.stretches]
 
     def _hysteresis_alone(self) -> Fit:
-        """Return H and a pure delay, the best of a few and then of their neighbours."""
+        """Fit H and a pure delay, first at coarse delays and then between the best neighbours."""
         tried: dict[int, Fit] = {}
 
         def at(d: int) -> Fit:
@@ -331,12 +332,12 @@ class Search:
             try:
                 found.append(self._fit(start, FEW))
             except IdentificationError:
-                # a start that diverges is none
+                # a start that diverges is dropped
                 continue
         return found
 
 
 def _with_dynamics(stage: Stage, d: int, G: Dynamics) -> Stage:
-    """Return a stage with another G, whose gain goes into H."""
+    """Replace G of a stage; the gain of G goes into H."""
     gain = G.gain
     return replace(stage, dynamics=G.normalised(), delay=d, coefficients=stage.coefficients * gain)

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What is held out of unlabelled runs: stretches that leave most of every band and of the range.
+Choose the held-out samples of unlabelled runs.
 
-A record that ends in its only chirp would lose G to its own test, and one with a single step too.
+The rest of a run keeps most of the voltage range and most of the energy of every frequency band.
+Without this rule a record that ends in its only chirp, or holds a single step, could lose the
+motion that identifies G.
 """
 
 from __future__ import annotations
@@ -19,30 +21,31 @@ from piezo_ident.identification.prepare import Run
 from piezo_ident.identification.results import Settings
 from piezo_ident.identification.spectra import HIGH_PASS, rms_above
 
-#: samples at the end of an unlabelled record that an error needs at least
+#: smallest number of samples at the end of an unlabelled record that gives an error
 MIN_HELD = 10
-#: samples that a fit needs at least
+#: smallest number of samples for a fit
 MIN_FIT = 100
-#: share of its range by which the voltage of a run has to move
+#: share of its range by which the voltage of a run must move
 MOVES = 0.02
-#: runs that are fitted, those of the widest range first
+#: most runs that are fitted, the widest range first
 MOST_RUNS = 8
-#: stretches that are held out of a run together (taste)
+#: number of held-out stretches in a run (taste)
 STRETCHES = 4
-#: places of the stretches that are tried, from the end backwards
+#: number of positions of the stretches that are tried, from the end backwards
 PLACES = 20
-#: edges of the bands [Hz] above `HIGH_PASS`, and the rms of a band that counts, normalised
+#: edges of the bands [Hz] above `HIGH_PASS`, and the smallest rms of a band that counts,
+#: normalised
 EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
-#: share of the range, and of the energy of every band, that has to stay in the rest (taste)
+#: share of the range, and of the energy of every band, that must stay in the rest (taste)
 STAYS = 0.65
 
 
 def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], list[Mask]]:
     """
-    Return the runs that are fitted, the widest first, and which samples of each.
+    Choose the runs that are fitted, the widest first, and the fitted samples of each.
 
-    With `hold_out` set the end is held out, else a few stretches all over each run.
-    IdentificationError when what is left of the widest to fit or to judge by is too short.
+    With `hold_out` the end of each run is held out, else a few stretches spread over it.  Raises
+    IdentificationError if the widest run has too few samples to fit or to judge by.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
     chosen: list[Run] = []
@@ -79,11 +82,11 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
 
 def held_out_stretches(u: Array, rate: float, n_held: int) -> Mask:
     """
-    Return which samples of a normalised voltage u are held out, shape (n,).
+    Mark the samples of a normalised voltage u that are held out, shape (n,).
 
-    They are `n_held` samples in a few stretches all over the run.  The end is among them where it
-    can be: stretches in between would not show what drifts.  Where the rest would lack what only
-    they excite, all stretches move towards the beginning.
+    `n_held` samples are held out in a few stretches spread over the run.  The last stretch lies at
+    the end if possible, because only the end shows drift.  All stretches move towards the
+    beginning if the rest would otherwise lack motion that the stretches alone hold.
     """
     n, size = u.size, n_held // STRETCHES
     ends = np.linspace(0, n, STRETCHES + 1).astype(int)[1:]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-From records to a model: the three steps in order, or all at once where nothing is labelled.
+Identify a stage from its records: in three steps, or by one fit if nothing is labelled.
 
 Gu, Li, Zhu and Su, "Modeling and Identification of Piezoelectric-Actuated Stages Cascading
 Hysteresis Nonlinearity With Linear Dynamics", IEEE/ASME Trans. Mechatronics 21(3), 2016,
@@ -72,9 +72,9 @@ from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 import scipy
 
-#: share by which a model may err more without a pair of G that H may stand for
+#: a model without a pair of poles and zeros that H may replace may err more by this share
 AS_WELL = 0.01
-#: largest orders that are tried then, too
+#: largest orders that are tried besides `Settings.max_order` if G has such a pair
 SMALLER = (8, 4)
 _UNLABELLED = (
     '{}: no segments are labelled {}; drive the stage with the program identification, or '
@@ -91,22 +91,22 @@ def identify(
     steps: Steps | None = None,
 ) -> Identification:
     """
-    Learn a stage from its records.
+    Identify a stage from its records.
 
     Parameters
     ----------
     records : sequence of Record, or Record
-        With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
-        of other kinds are then left for validation.  Without them every run is fitted in one
-        go, but for what is held out.
+        Records with segments ``noise`` and ``triangle`` (and ``step``) are identified in three
+        steps, and segments of other kinds are left for validation.  Without them one fit covers
+        every run except its held-out samples.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
-        Records that are neither fitted nor looked at; the headline is about them.
+        Records that are not used for fitting or choosing; the headline is their error.
     progress : callable, optional
-        Called with the name of the step and its share done; may raise `Cancelled`.
+        Called with the name of the step and its share done; it may raise `Cancelled`.
     steps : Steps, optional
-        Steps of the three that were taken already, from `first_steps`; where they are given,
-        even empty ones, records without labelled segments are refused.
+        Results of steps that were taken before, from `first_steps`.  If they are given, even
+        empty, records without labelled segments are refused.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def identify(
     Raises
     ------
     IdentificationError
-        When the data do not carry a model; the message says what they lack.
+        If the data do not carry a model; the message says what they lack.
 
     Examples
     --------
@@ -158,7 +158,7 @@ def _identify(
 
     fit = fitted(runs)
     if any(piece.sound is not None for piece in data.pieces):
-        # a regression of fast motion needs better than straight lines over what was lost
+        # fit again with lost readings replaced by the prediction, which is better than a line
         fit = fitted([filled_in(p.run, p.y_hat, scaling) for p in predicted(fit)[1]])
     model, stroke = fit.model, abs(scaling.Y)
     judged, predictions = predicted(fit)
@@ -203,7 +203,7 @@ def _labelled(
     delay = Delay(delay_result.samples)
 
     def fitted(dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
-        # the starts with what is known of the lag by now
+        # fit the starts again with the lag of this G
         runs = with_starts(unstarted, lag_of(G, delay))
         fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
         small = small_excerpts(runs)
@@ -217,7 +217,7 @@ def _labelled(
             if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
                 hysteresis, fitted_to = other, motion
         if hysteresis.law != 'plays':
-            # G was found beside plays
+            # G was found with plays
             refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
             if refined is not None:
                 dynamics, G = refined
@@ -231,10 +231,10 @@ def _labelled(
         found = [best]
         for size in (settings.max_order, *sizes):
             of_size = replace(settings, max_order=size)
-            # of so few orders none need be stable
+            # no model of so low an order need be stable
             with suppress(IdentificationError):
                 found.append(fitted(*second_step(runs, delay, of_size, progress, True), True))
-        # H may do as well what the pair does, and large orders fit what H misses of the noise
+        # H may replace the pair, and large orders fit the error of H on the noise
         limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in found)
         best = next((one for one in reversed(found) if one.left < limit), best)
     runs, fit, held, model = best.runs, best.fit, best.held, best.model
@@ -284,7 +284,7 @@ def _labelled(
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """What the second and the third step gave, and what their model leaves of what chooses."""
+    """Results of the second and the third step, and the squares left on the selection data."""
 
     runs: Sequence[Run]
     fit: Sequence[Excerpt]
@@ -304,7 +304,7 @@ def first_steps(
     progress: Progress,
 ) -> Steps:
     """
-    Take the first step alone, or the second one and what it needs of the first.
+    Take the first step alone, or the second step and the first if it is missing.
 
     Parameters
     ----------
@@ -314,14 +314,14 @@ def first_steps(
     settings : Settings
     which : {'delay', 'dynamics'}
     steps : Steps or None
-        What was found already.
+        Results of earlier steps.
     progress : callable
         As for `identify`.
 
     Raises
     ------
     IdentificationError
-        When the data do not carry this step.
+        If the data do not carry this step.
     """
     data, steps = prepare(records), (steps or Steps()).beside(settings.delay)
     with singular_is_ours():
@@ -339,7 +339,7 @@ def first_steps(
 def _provenance(
     result: Identification, records: Sequence[Record], fast: Sequence[float]
 ) -> dict[str, Any]:
-    """Return what the model file says about its origin."""
+    """Collect the entry of the model file about its origin."""
     fit, dynamics = result.hysteresis, result.dynamics
     m, na = fit.hysteresis.thresholds.size, dynamics.order[0]
     sigma = np.sqrt(np.maximum(np.diag(dynamics.covariance), 0.0))

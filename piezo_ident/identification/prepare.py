@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records made ready for fitting: one rate, one scaling, normalised runs with their masks."""
+"""Prepare records for fitting: one sampling rate, one scaling, normalised runs with masks."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from piezo_ident.record.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.suspicions import rises_first, suspicions
 
-#: share of a triangle that is one block of held-out data, and how many blocks share one
+#: number of blocks into which a triangle is cut; one in `EVERY` is held out
 BLOCKS, EVERY = 60, 5
 #: share at the end of every noise and step segment that is not fitted
 END_HELD = 0.2
-#: a record starts from a known memory when its voltage starts within this share of the lowest
+#: a record starts with a known memory if its voltage starts within this share of the lowest
 REST = 0.01
-#: how far the voltage may move within one averaged row, as a share of its range
+#: largest change of the voltage within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
-#: samples in a row whose readings may be lost where the voltage turns (taste; held-out blocks,
-#: which hold no turn, are longer)
+#: most lost readings in a row that `Excerpt.span` bridges, as the voltage may turn there (taste;
+#: held-out blocks hold no turn, and are longer)
 LOST = 50
-#: averages that tell a correlation at least (taste)
+#: smallest number of averages that tells a correlation (taste)
 AVERAGES = 20
-#: samples of all records that are used, at some 60 bytes each; of longer ones the first
+#: number of samples of all records that are used, at some 60 bytes each; longer records are cut
 MOST_SAMPLES = 40_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Excerpt:
     """
-    Input and output of a fit, and which samples count.
+    Input and output of a fit, with a mask of the samples that count.
 
     Attributes
     ----------
     u, x : ndarray, shape (n,)
-        Normalised input and displacement; plays and dynamics need all of the input.
+        Normalised input and displacement; plays and dynamics need the whole input.
     use : ndarray of bool, shape (n,)
         Samples that count.
     memory : callable, optional
-        Play outputs before the first sample, as a function of the thresholds; that of a stage
-        which last came down to zero when absent.
+        Play outputs before the first sample, as a function of the thresholds.  By default they
+        are the outputs of a stage that last came down to the lowest voltage.
     """
 
     u: Array
@@ -62,48 +62,48 @@ class Excerpt:
     memory: Callable[[Array], Array] | None = None
 
     def start(self, thresholds: Array) -> Array:
-        """Return the play outputs before the first sample."""
+        """Compute the play outputs before the first sample."""
         if self.memory is None:
             return initial_memory(float(self.u[0]), thresholds)
         return self.memory(thresholds)
 
     @functools.cached_property
     def stretches(self) -> list[tuple[int, int]]:
-        """The unbroken stretches of samples that count, as (start, stop)."""
+        """Unbroken stretches of samples that count, as (start, stop)."""
         return true_runs(self.use)
 
     @functools.cached_property
     def joined(self) -> list[tuple[int, int]]:
         """
-        The stretches, which go on over a few samples that do not count.
+        Stretches, joined over short gaps of samples that do not count.
 
-        Lost readings do no harm where a regression runs through the straight line in their place.
+        A regression may run through the straight line that replaces a few lost readings.
         """
         return true_runs(closed(self.use, FEW))
 
     @functools.cached_property
     def span(self) -> tuple[float, float]:
-        """Lowest and highest input of the stretches: a lost reading has its voltage."""
+        """Lowest and highest input of the stretches; the voltage of a lost reading is known."""
         u = self.u[closed(self.use, LOST)]
         return (float(u.min()), float(u.max())) if u.size else (np.inf, -np.inf)
 
     @property
     def swing(self) -> float:
-        """Width of `span`; zero where no sample counts."""
+        """Width of `span`; zero if no sample counts."""
         return max(self.span[1] - self.span[0], 0.0)
 
     @functools.cached_property
     def averaged(self) -> list[tuple[int, int]]:
         """
-        The stretches whose rows are averaged, which go on over gaps shorter than a row.
+        Stretches whose rows are averaged, joined over gaps shorter than a row.
 
-        Within a row the voltage hardly moves, and a straight line is what the stage does.
+        Within a row the voltage hardly changes, so a straight line describes the stage.
         """
         return true_runs(closed(self.use, min(FEW, self.row - 1)))
 
     @functools.cached_property
     def row(self) -> int:
-        """Samples that one row of a fit of H may average."""
+        """Number of samples that one row of a fit of H may average."""
         if not self.use.any():
             return 1
         speed = float(np.abs(np.diff(self.u)).max(initial=0.0, where=self.use[1:]))
@@ -114,22 +114,22 @@ class Excerpt:
 
     @property
     def rows(self) -> int:
-        """Rows that these samples become; white noise is independent from row to row."""
+        """Number of rows after averaging; white noise is independent from row to row."""
         return sum((stop - start) // self.row for start, stop in self.averaged)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Run(Excerpt):
     """
-    One piece, normalised; the samples that count were measured, away from a bridged gap.
+    Normalised piece; the samples that count were measured, away from a bridged gap.
 
     Attributes
     ----------
     record : str
-        Name of the record it belongs to.
+        Name of the record of the piece.
     piece : Piece
     known : ndarray of bool, shape (n,)
-        Samples that count and at which the memory of the start no longer matters, or was known.
+        Samples that count, after the memory of the start was forgotten, if it was unknown.
     """
 
     record: str
@@ -137,15 +137,15 @@ class Run(Excerpt):
     known: Mask
 
     def through(self, hysteresis: Hysteresis) -> Array:
-        """Return what H makes of the input, from the start of this run."""
+        """Compute the output of H for the input, from the start of this run."""
         return hysteresis(self.u, self.start(hysteresis.thresholds))
 
     def excerpt(self, use: Mask) -> Excerpt:
-        """Return this run with other samples that count."""
+        """Cut out this run with another mask of samples that count."""
         return Excerpt(self.u, self.x, use, self.memory)
 
     def mask(self, *kinds: str) -> Mask:
-        """Return which samples belong to segments of these kinds."""
+        """Mark the samples in segments of these kinds."""
         chosen = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
             if s.kind in kinds:
@@ -154,10 +154,10 @@ class Run(Excerpt):
 
     def unbroken(self, start: int, stop: int) -> list[tuple[int, int]]:
         """
-        Return the stretches between two samples that hold no long gap.
+        Find the stretches between two samples that hold no long gap.
 
-        A sample or two that were bridged do no harm where a regression runs through them; a
-        straight line of many does.
+        A regression may run through one or two bridged samples, but a straight line of many
+        samples would bias it.
         """
         whole = np.ones(stop - start, dtype=bool)
         for a, b in true_runs(~self.use[start:stop]):
@@ -167,9 +167,10 @@ class Run(Excerpt):
 
     def held_out(self) -> Mask:
         """
-        Return which samples of triangle, noise and steps are kept from every fit.
+        Mark the samples of triangle, noise and steps that no fit uses.
 
-        Of a triangle every fifth block that holds no turning point, of the others the end.
+        In a triangle these are every fifth block without a turning point, in noise and steps the
+        end of the segment.
         """
         held = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
@@ -192,16 +193,16 @@ class Prepared:
     Attributes
     ----------
     rate : float
-        [Hz]
+        Sampling rate [Hz].
     scaling : Scaling
     records : list of Record
-        The records, their faulty readings left out.
+        Records without their faulty readings.
     pieces : list of Piece
-        Of this rate.
+        Pieces at this sampling rate.
     runs : list of Run
-        The pieces, normalised.
+        Normalised pieces.
     warnings : list of str
-        Faults of the data, and what is left out.
+        Faults of the data, and data that are left out.
     """
 
     rate: float
@@ -213,21 +214,21 @@ class Prepared:
 
     @property
     def kinds(self) -> set[str]:
-        """Kinds of segments that there are."""
+        """Kinds of the segments."""
         return {s.kind for p in self.pieces for s in p.segments}
 
     @property
     def labelled(self) -> bool:
-        """Whether there are noise and a triangle, so that the three steps can be taken."""
+        """Whether the records hold noise and a triangle, as the three steps need."""
         return {'noise', 'triangle'} <= self.kinds
 
 
 def prepare(records: Sequence[Record]) -> Prepared:
     """
-    Make records ready for the steps.
+    Prepare records for the identification.
 
-    Records that carry no response of a stage to a voltage raise IdentificationError, one without
-    displacement DataError.
+    Raises IdentificationError if the displacement does not answer the voltage, and DataError if a
+    record has no displacement.
     """
     if not records:
         raise IdentificationError('no record was given')
@@ -252,7 +253,7 @@ def prepare(records: Sequence[Record]) -> Prepared:
                 f'samples or {lost:.2g} s; neither they nor the moment after each were fitted or '
                 'judged'
             )
-    # of columns that are swapped, v has the noise of a sensor
+    # if the columns are swapped, v has the noise of a sensor, which quiet voltage would hide
     faults += [text for record in measured for text in suspicions(record)]
     runs = runs_of(records, rate, scaling)
     return Prepared(rate, scaling, measured, pieces, runs, faults + left)
@@ -260,22 +261,22 @@ def prepare(records: Sequence[Record]) -> Prepared:
 
 def filled_in(run: Run, simulated: Array, scaling: Scaling) -> Run:
     """
-    Return a run in which a simulated displacement [m] stands in for what was not measured.
+    Replace lost readings of a run by a simulated displacement [m].
 
-    What it leaves of the samples around goes on in between by a straight line.
+    The error of the simulation around a gap is added within it, along a straight line.
     """
     y = simulated + interpolated(run.piece.y - simulated, ~run.use)
     return replace(run, x=scaling.x(y), piece=replace(run.piece, y=y))
 
 
 def fault_lines(records: Sequence[Record]) -> list[str]:
-    """Return what was wrong with records, a line for each fault."""
+    """List the faults of records, one line each."""
     return [f'{r.name}: {fault}' for r in records for fault in r.faults if not fault.is_note]
 
 
 def same_rate(one: float, other: float) -> bool:
     """
-    Return whether two sampling rates differ by no more than rounding (1e-6).
+    Compare two sampling rates; differences below 1e-6 are rounding.
 
     Examples
     --------
@@ -287,9 +288,9 @@ def same_rate(one: float, other: float) -> bool:
 
 def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
     """
-    Return the sampling rate that carries the most voltage travel, and what is left out.
+    Choose the sampling rate that carries the most voltage travel, and list the data left out.
 
-    A voltage that never moves raises IdentificationError.
+    Raises IdentificationError if the voltage never moves.
     """
     travel: dict[float, float] = {}
     time: dict[float, float] = {}
@@ -315,9 +316,9 @@ def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
 
 def scaling_of(pieces: Sequence[Piece]) -> Scaling:
     """
-    Return the normalisation: voltage range and stroke to 1, the sign of the gain in Y.
+    Normalise: voltage range and stroke become 1, and Y takes the sign of the gain.
 
-    Where voltage or displacement never move it raises IdentificationError.
+    Raises IdentificationError if the voltage or the displacement never moves.
     """
     low = min(float(p.v.min()) for p in pieces)
     high = max(float(p.v.max()) for p in pieces)
@@ -334,10 +335,10 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
 
 def _correlation(piece: Piece) -> float:
     """
-    Return the correlation of voltage and displacement, of averages over the time that shows most.
+    Correlate averages of voltage and displacement, over the averaging time that correlates most.
 
-    Above a resonance a stage moves against its voltage, so that fast motion tells no sign.  Few
-    averages correlate by chance: n of them by 1 / sqrt(n).
+    Above a resonance a stage moves against its voltage, so fast motion does not tell the sign.  n
+    averages correlate by chance by 1 / sqrt(n), which is subtracted.
     """
     best = 0.0
     size = 1
@@ -356,10 +357,10 @@ def runs_of(
     records: Sequence[Record], rate: float, scaling: Scaling, enough: float = np.inf
 ) -> list[Run]:
     """
-    Return the pieces of one rate, joined over short gaps and normalised.
+    Normalise the pieces of one sampling rate, joined over short gaps.
 
-    Behind an unknown start they are known once the voltage has swept nearly all of its range, or
-    `enough`, normalised.
+    After an unknown start, samples count as known once the voltage has swept nearly all of its
+    range, or `enough` of it (normalised).
     """
     runs = []
     for record in records:

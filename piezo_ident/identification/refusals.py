@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records that carry no response of a stage to a voltage: undriven, or under position control."""
+"""Refuse records without a response to the voltage: undriven, or under position control."""
 
 from __future__ import annotations
 
@@ -16,35 +16,38 @@ from piezo_ident.residual.coherence import cross_spectra
 from piezo_ident.residual.stretches import block_means
 from scipy import signal
 
-#: chance below which the displacement answers the voltage, and samples that it takes to tell
+#: largest chance at which a coherence proves an answer, and smallest number of samples for the
+#: test
 CHANCE, MIN_COHERENCE = 1e-7, 256
-#: means to which a record is thinned for its slow motion
+#: number of means to which a record is thinned for its slow motion
 MEANS = 1 << 15
-#: means into which a ramp is divided
+#: number of means into which a stretch is divided to find ramps
 RAMP = 64
-#: share by which a model with the voltage must err less on held-out parts than one without it
+#: share by which a model with the voltage must err less on held-out parts than without it
 BETTER = 0.1
-#: error that is rounding [% of stroke]
+#: error due to rounding [% of stroke]
 ROUNDING = 1e-9
-#: parts that are predicted in turn, means to which a piece is thinned for that, and plays
+#: number of parts that are predicted in turn, of means to which a piece is thinned, and of plays
 PARTS, ROWS, PLAYS = 8, 500, 8
 #: rates of the decays of a slow drift, in 1 / duration
 DECAYS = 2.0 ** np.arange(-1.0, 7.0, 0.5)
-#: a measured stage under position control stays this close to a straight line, as a share of its
-#: travel (2.4e-4), while its drive bends by 18 times as much or more
+#: largest bend of a position under control, as a share of its travel (a measured stage stays
+#: within 2.4e-4), and smallest bend of its drive relative to it (a measured drive bends 18 times
+#: as much)
 STRAIGHT, BENT = 5e-4, 15.0
 
 
 def refuse_undriven(records: Sequence[Record]) -> None:
     """
-    Refuse records whose displacement is no answer to the voltage, with an IdentificationError.
+    Refuse records whose displacement does not answer the voltage, with an IdentificationError.
 
-    Two proofs of an answer are known.  Somewhere the spectra of voltage and displacement are
-    coherent, by more than chance (1e-7): for Gaussian noise ``1 - c`` raised to ``L - 1`` is the
-    chance of a coherence c over L segments, whatever the displacement does.  A line is taken out
-    of each segment.  Kept, it counts where the voltage moves by far more than its own noise: two
-    drifts agree by chance.  Or, as one loop of a strong hysteresis has little coherence, a model
-    with the voltage predicts parts of the record better than any without.
+    Either of two proofs accepts the records.  First, the spectra of voltage and displacement are
+    more coherent at some frequency than by chance (1e-7).  For Gaussian noise the chance of a
+    coherence c over L segments is ``1 - c`` raised to ``L - 1``, for any displacement.  A line is
+    taken out of each segment.  The line is kept only if the voltage moves by far more than its
+    noise, because two drifts agree by chance.  Second, a model with the voltage predicts parts of
+    the record better than any model without it.  A single loop of strong hysteresis needs this
+    proof, as its coherence is low.
     """
     pieces = [piece for record in records for piece in record if np.ptp(piece.v) > 0.0]
     if any(piece.n < MIN_COHERENCE for piece in pieces):
@@ -57,7 +60,7 @@ def refuse_undriven(records: Sequence[Record]) -> None:
         return
     errors = [held_out_errors(piece) for piece in pieces if np.ptp(piece.y) > 0.0]
     if not errors:
-        return  # what never moves is told by `scaling_of`
+        return  # `scaling_of` refuses a displacement that never moves
     driven, resting = min(errors, key=lambda pair: pair[0] - (1.0 - BETTER) * pair[1])
     if driven < (1.0 - BETTER) * resting - ROUNDING:
         return
@@ -72,12 +75,12 @@ def refuse_undriven(records: Sequence[Record]) -> None:
 
 def held_out_errors(piece: Piece) -> tuple[float, float]:
     """
-    Return what the best model with the voltage, and the best without, leave of held-out parts.
+    Predict held-out parts by the best model with the voltage, and by the best model without it.
 
-    Both rms, in % of the stroke; each of `PARTS` parts is predicted from all others.  Without the
-    voltage there are a mean, a line, and for slow drift a cubic, a logarithm and a decay in time.
-    With it there are powers of the voltage, and plays whose weight may go with the voltage, on a
-    mean or a line.
+    Both errors are rms values in % of the stroke.  Each of `PARTS` parts is predicted from all
+    other parts.  Models without the voltage are a mean, a line, and for slow drift a cubic, a
+    logarithm and a decay in time.  Models with the voltage are powers of it, or powers and plays
+    whose weight may vary with it, on top of a mean or a line.
     """
     m = max(1, piece.n // ROWS)
     v, y = block_means(piece.v, m), block_means(piece.y, m)
@@ -99,7 +102,7 @@ def held_out_errors(piece: Piece) -> tuple[float, float]:
 
 
 def _left_of_parts(A: Array, y: Array) -> float:
-    """Return the rms that least squares on all other parts leave of each part."""
+    """Compute the rms error of parts, each predicted by least squares on all other parts."""
     left = 0.0
     for part in np.array_split(np.arange(y.size), PARTS):
         rest = np.delete(np.arange(y.size), part)
@@ -119,14 +122,14 @@ def refuse_delay(pieces: Sequence[Piece], delay: int | None) -> None:
 
 
 def _moves(v: Array) -> bool:
-    """Return whether a voltage moves by far more than its noise."""
+    """Tell whether a voltage moves by far more than its noise."""
     rows = v[: v.size // 64 * 64].reshape(64, -1)
     noise = float(np.median(np.std(signal.detrend(rows), axis=1)))
     return bool(np.ptp(rows.mean(axis=1)) > 10.0 * noise)
 
 
 def _chance(piece: Piece, *, linear: bool) -> float:
-    """Return the chance that noise is as coherent with the displacement as the voltage is."""
+    """Bound the chance that noise is as coherent with the displacement as the voltage is."""
     chance = 1.0
     # slow motion shows in a few means of the record, fast motion in short segments
     m = max(1, piece.n // MEANS)
@@ -135,11 +138,11 @@ def _chance(piece: Piece, *, linear: bool) -> float:
         if v.size < 8 * size or chance < CHANCE:
             continue
         s_vv, s_yy, s_vy = cross_spectra(v, y, size, linear=linear)
-        # what detrending leaves of a straight line is rounding
+        # detrending a straight line leaves only rounding, which has no coherence
         power = (s_vv > 1e-12 * s_vv.max(initial=0.0)) & (s_yy > 1e-12 * s_yy.max(initial=0.0))
         if power.any():
             coherence = np.abs(s_vy[power]) ** 2 / (s_vv[power] * s_yy[power])
-            # Hann segments that overlap by half are worth 0.6 of their number
+            # Hann segments that overlap by half count as 0.6 of their number
             left = (1.0 - min(1.0, float(coherence.max()))) ** (1.2 * v.size / size - 1.6)
             chance = min(chance, float(power.sum()) * left)
     return chance
@@ -147,10 +150,10 @@ def _chance(piece: Piece, *, linear: bool) -> float:
 
 def refuse_closed_loop(record: Record) -> None:
     """
-    Refuse a record under position control, where the voltage is the answer.
+    Refuse a record under position control, where the voltage answers the position.
 
-    Two signs are known: the drive moves while the position is held, and the position follows a
-    straight line more closely than the drive.  A stage under voltage control does neither: it
+    Two signs are known.  The drive moves while the position is held, or the position follows a
+    straight line more closely than the drive.  Neither happens under voltage control: the stage
     creeps, and its hysteresis bends the displacement, not the voltage.
     """
     span, stroke = float(np.ptp(record.voltage_range)), record.stroke
@@ -203,7 +206,7 @@ def _refuse_ramp(name: str, piece: Piece, span: float, stroke: float) -> None:
 
 
 def _bend(x: Array) -> float:
-    """Return the rms deviation from a straight line, as a share of the line's travel."""
+    """Compute the rms deviation from a straight line, as a share of the travel of the line."""
     k = np.linspace(-0.5, 0.5, x.size)
     travel = float(k @ x / (k @ k))
     return float(np.std(x - travel * k)) / max(abs(travel), np.finfo(float).tiny)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an identification is asked for, and what it gives back."""
+"""Settings and results of an identification."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from piezo_ident.record.record import Record
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = Mapping[tuple[str, float], StartLike]
-#: called with the name of the step and the share of it that is done; raises `Cancelled` to stop
+#: callback with the name of the step and its share done; it raises `Cancelled` to stop
 Progress = Callable[[str, float], None]
 
 
@@ -36,40 +36,40 @@ def silent(step: str, share: float) -> None:
 @dataclass(frozen=True)
 class Settings:
     """
-    How to identify.
+    Settings of an identification.
 
     Attributes
     ----------
     thresholds : int, optional
-        Number of plays of H, that at r = 0 included, evenly spaced over the excited range; the
-        paper takes ten.  Number and places are chosen by held-out error when absent.
+        Number of plays of H, including the play at r = 0, evenly spaced over the excited range.
+        The paper takes ten.  By default, number and places are chosen by held-out error.
     solver : {'least_squares', 'swarm'}
-        How the weights are found.  Least squares finds the optimum of this convex problem; the
-        swarm is the paper's solver, and the model holds what the swarm found.
+        Solver of the weights.  Least squares finds the optimum of this convex problem.  The swarm
+        is the solver of the paper, and the model keeps its weights unless `polish` is set.
     polish : bool
-        Let bounded least squares finish what the swarm found.
+        Let bounded least squares finish the fit of the swarm.
     max_order : int
-        Largest na and nb that are tried.
+        Largest na and nb of the search.
     order : tuple of int, optional
-        (na, nb) instead of a search.
+        Orders (na, nb); no search takes place.
     delay : int, optional
-        Delay [samples] instead of the one found.
+        Delay [samples]; no delay is fitted.
     swarm_size, swarm_iterations : int
-        Size of the swarm, and most iterations.
+        Number of particles, and most iterations.
     hold_out : float, optional
-        Seconds at the end of an unlabelled record that are not fitted; a fifth of it in four
-        stretches when absent.
+        Seconds at the end of an unlabelled record that are not fitted.  By default a fifth of the
+        record in four stretches is not fitted.
     seed : int
-        For everything that is drawn by chance.
+        Seed of everything random.
 
     Raises
     ------
     ConfigError
-        When a value is out of range.
+        If a value is out of range.
 
     Examples
     --------
-    The paper's way:
+    Settings of the paper:
 
     >>> paper = Settings(thresholds=10, solver='swarm')
     """
@@ -118,15 +118,15 @@ class DelayResult:
     ----------
     samples : int
     std : float
-        [samples]; infinite when the data do not tell, or were not asked.
+        Standard deviation [samples]; infinite if it is unknown or was not estimated.
     source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
         One-step ARX loss for d = 0, 1, ...
     scan : int or None
-        Delay that the scan points to.
+        Delay of the scan.
     fraction : float
-        Further part of a sample, where the data show it.
+        Fraction of a sample in addition to `samples`, if the data show it.
     """
 
     samples: int
@@ -139,14 +139,14 @@ class DelayResult:
 
     @property
     def agree(self) -> bool | None:
-        """Whether steps and scan agree within a sample; None when one is missing."""
+        """Whether steps and scan agree within a sample; None if one of them is missing."""
         if self.step is None or self.step.samples is None or self.scan is None:
             return None
         return abs(self.step.samples - self.scan) <= 1
 
     @property
     def unknown(self) -> DelayResult:
-        """The same steps and scan where the model is better off without their delay."""
+        """Same steps and scan with a delay of 0, for a model that errs less without a delay."""
         return replace(self, samples=0, fraction=0.0, std=float('inf'), source='none')
 
 
@@ -160,19 +160,19 @@ class DynamicsResult:
     order : tuple of int
         (na, nb); (0, 1) stands for G = 1.
     table : OrderTable or None
-        Least squares at every order, with the hysteresis undone.
+        Least squares at every order, after the hysteresis was undone.
     methods : dict of str to float
         Held-out free-run error of least squares, instrumental variables and output error at the
-        order chosen, in % of the rms of the held-out output; infinite when unstable.
+        chosen order, in % of the rms of the held-out output; infinite if unstable.
     covariance : ndarray, shape (na + nb, na + nb)
-        Of (a, b).
+        Covariance of (a, b).
     response : FrequencyResponse or None
-        Measured, normalised: from voltage to displacement on a noise segment, else on any
-        broadband motion from behind H.
+        Measured response, normalised: from voltage to displacement on a noise segment, else from
+        the output of H to displacement on any broadband motion.
     bias : float
-        Voltage around which it was measured, normalised.
+        Mean voltage of the measured noise, normalised.
     slope_measured, slope_model : float
-        Small-signal gain of the measured displacement at this bias, and that of H, normalised.
+        Small-signal gain of the measured displacement at this bias, and of H, normalised.
     band : float
         Highest frequency with power in the input [Hz].
     """
@@ -196,13 +196,13 @@ class DynamicsResult:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What single steps have found so far."""
+    """Results of single steps so far."""
 
     delay: DelayResult | None = None
     dynamics: tuple[DynamicsResult, Dynamics] | None = None
 
     def beside(self, delay: int | None) -> Steps:
-        """Return these steps; none of them where they were taken with another given delay."""
+        """Keep these results if they agree with the given delay; else drop all of them."""
         before = self.delay
         was_given = before is not None and before.source == 'given'
         is_same = before is not None and before.samples == delay
@@ -218,16 +218,16 @@ class ErrorRow:
     ----------
     record, segment : str
     percent : float
-        `piezo_ident.model.metrics.percent_of_stroke`, by the stroke of the whole record.
+        `piezo_ident.model.metrics.percent_of_stroke` with the stroke of the whole record.
     static_percent : float
-        The same for the hysteresis alone.
+        Same error for the hysteresis alone.
     fit : float
         `piezo_ident.model.metrics.fit_percent`.
     n : int
-        Samples.
+        Number of samples.
     data : {'fitted', 'selection', 'held out', 'validation'}
-        What these samples were used for: 'selection' was not fitted but chose between models,
-        'validation' lies in a record that was given for validation.
+        Use of these samples: 'selection' was not fitted but chose between models, 'validation'
+        lies in a record that was given for validation.
     """
 
     record: str
@@ -240,25 +240,25 @@ class ErrorRow:
 
     @property
     def driven(self) -> bool:
-        """Whether the voltage tests the stage here, rather than rests or moves over."""
+        """Whether the voltage tests the stage in this stretch, not rest or slow positioning."""
         return self.segment.partition(':')[0] not in ('idle', 'ramp')
 
 
 @dataclass(frozen=True)
 class Headline:
     """
-    The error of a model and that of its hysteresis alone, over the same samples.
+    Error of a model, and of its hysteresis alone, over the same samples.
 
     Attributes
     ----------
     data : {'validation', 'held out', 'selection', 'fitted'}
-        Kind of data, the first of these that there is.
+        First of these kinds that has data.
     records : tuple of str
-        Names of the records that hold it.
+        Names of the records of these data.
     percent, static_percent : float
-        As in `ErrorRow`, over all driven samples; NaN without any.
+        As in `ErrorRow`, over all driven samples; NaN without driven samples.
     n : int
-        Samples.
+        Number of samples.
     """
 
     data: str
@@ -271,21 +271,22 @@ class Headline:
 @dataclass(frozen=True, eq=False)
 class FitOutcome:
     """
-    What either way of fitting gives, with labelled segments or without.
+    Result of a fit, in three steps or by one free-run fit.
 
     Attributes
     ----------
     model, delay, dynamics, hysteresis
         As in `Identification`.
     masks : sequence of (fitted, selection)
-        Of each run, the samples that were fitted and those that only chose between models.
+        For each run, the fitted samples and the samples that only chose between models.
     warnings : sequence of str
     not_identified, memories
         As in `Identification`.
     offsets : mapping
-        How far the zero of displacement of a run lies from that of the model [m], as `memories`.
+        Distance of the zero of displacement of a run from the zero of the model [m]; keys as in
+        `memories`.
     judged : (StageModel, Memories) or None
-        What the errors are those of, where H was fitted to all data in the end.
+        Model and memories whose errors are reported, if the final model was fitted to all data.
     """
 
     model: StageModel
@@ -302,9 +303,9 @@ class FitOutcome:
 
 def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
     """
-    Return the error over some rows together, weighted by samples; NaN without rows.
+    Compute the common rms error of rows, weighted by samples; NaN without rows.
 
-    `static`: of the hysteresis alone instead of the whole model.
+    `static` takes the error of the hysteresis alone.
     """
     n = sum(row.n for row in rows)
     squares = sum(row.n * (row.static_percent if static else row.percent) ** 2 for row in rows)
@@ -327,17 +328,17 @@ class Identification(Showable):
         Rms of the sensor noise, % of stroke.
     noise_source : str
     stroke : float
-        [m]
+        Stroke of the records [m].
     warnings : tuple of str
-        What a reader has to know.
+        Warnings for the reader.
     not_identified : tuple of (str, str)
-        What these data could not tell, and why.
+        Quantities that the data could not tell, with reasons.
     settings : Settings
     records : tuple of Record
-        What was fitted, then what was given for validation.
+        Fitted records, then the records for validation.
     memories : mapping of (str, float) to ndarray or Start
-        Fitted play outputs at the start of a piece, and creep that goes on there, by record name
-        and start time.
+        Fitted play outputs at the start of a piece, and creep that goes on from there; keys are
+        record name and start time.
 
     Examples
     --------
@@ -371,15 +372,15 @@ class Identification(Showable):
 
     def error(self, data: str) -> float:
         """
-        Return the error over all rows of a kind of data, weighted by samples; NaN if none.
+        Compute the rms error over one kind of data, weighted by samples; NaN without such data.
 
-        Ramps and rests do not count: they are easy, and would flatter.
+        Ramps and rests do not count: they are easy, and would lower the error.
         """
         return rms_percent(self._driven(data))
 
     @property
     def headline(self) -> Headline:
-        """The errors to quote: on data for validation if there are any, else on the next best."""
+        """Error to quote: on validation data, else on the next best kind of data."""
         data = next((kind for kind in KINDS if self._driven(kind)), 'fitted')
         rows = self._driven(data)
         return Headline(

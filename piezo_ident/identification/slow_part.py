@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a fit of G takes for dynamics and is none: slow real poles, and pairs below the modes."""
+"""Remove poles of G that do not belong to the dynamics: slow real poles, pairs below the modes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.operators.dynamics import Dynamics
 
-#: real poles below this are creep or what H lacks, never dynamics [Hz]
+#: real poles below this frequency come from creep or from errors of H, not from dynamics [Hz]
 SLOWEST = 40.0
-#: at low sampling rates, as a share of the rate
+#: same limit at low sampling rates, as a share of the rate
 SLOWEST_SHARE = 0.01
-#: a real pole and a real zero whose frequencies differ by less than this factor may be what H
-#: lacks of small motion, below this share of the frequency of the lowest mode that rings (damping)
+#: a pole and a zero whose frequencies differ by less than the factor `PAIR` may come from errors
+#: of H on small motion, if they lie below the share `BELOW_MODES` of the lowest mode that rings; a
+#: mode rings if its damping is below `RINGS`
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 
 
 def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
-    """Return G with G(1) = 1 and without its slow real poles; None where slow poles stay."""
+    """Remove the slow real poles of G, with G(1) = 1; None if a slow pole cannot be removed."""
     slowest = min(SLOWEST, SLOWEST_SHARE * rate)
     poles = G.poles
     size = -np.log(np.maximum(np.abs(poles), 1e-300)) * rate / (2.0 * np.pi)
@@ -34,17 +35,17 @@ def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
 
 
 def fast_part(G: Dynamics, rate: float, lean: bool) -> Dynamics:
-    """Return G with G(1) = 1, without slow real poles where it can; `lean`, without pairs too."""
+    """Normalise G to G(1) = 1, without removable slow poles; `lean` removes pairs as well."""
     G = without_pairs(G, rate) if lean else G
     return without_slow_part(G, rate) or G.normalised()
 
 
 def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     """
-    Return G without poles that decay, far below its modes, each beside a near zero.
+    Remove decaying poles far below the modes of G, each with a zero of nearly its frequency.
 
-    Small loops that open less than H says make such a pair, and so does hysteresis that depends on
-    the rate.  Least squares may also place two of them off the real axis, strongly damped.
+    Such a pair arises if small loops open less than H predicts, or if the hysteresis depends on
+    the rate.  Least squares may also place two such poles off the real axis, strongly damped.
     """
     rings = [mode.frequency for mode in G.modes(rate) if mode.damping < RINGS]
     highest = BELOW_MODES * min(rings, default=0.0)
@@ -52,7 +53,7 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     for pole in sorted(poles[_decaying(poles, 0.0, highest, rate)], key=abs, reverse=True):
         size = float(_size(pole, rate))
         near = np.flatnonzero(_decaying(zeros, size / PAIR, size * PAIR, rate))
-        # conjugate ones go together
+        # a conjugate pair of poles goes with a conjugate pair of zeros
         count = 1 if pole.imag == 0.0 else 2
         chosen = near[np.argsort(np.abs(zeros[near] - pole))][:count]
         if pole.imag < 0.0 or chosen.size < count or abs(zeros[chosen].sum().imag) > 1e-9:
@@ -66,13 +67,13 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
 
 
 def _size(roots: ArrayLike, rate: float) -> Array:
-    """Return the natural frequencies of roots [Hz]."""
+    """Compute the natural frequencies of roots [Hz]."""
     z = np.asarray(roots, dtype=complex)
     return np.asarray(np.abs(np.log(np.where(z == 0.0, 1e-300, z))) * rate / (2.0 * np.pi))
 
 
 def _decaying(roots: NDArray[np.complex128], low: float, high: float, rate: float) -> Mask:
-    """Return the roots that do not ring, with frequencies between two [Hz]."""
+    """Mark the roots that do not ring, with frequencies between two limits [Hz]."""
     size = _size(roots, rate)
     decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)
     return np.asarray((size > low) & (size < high) & (decay > RINGS * size))

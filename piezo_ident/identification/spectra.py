@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Spectra of an input and its output: the band that is driven, coherence, frequency response."""
+"""Estimate spectra of an input and its output: driven band, coherence, frequency response."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from scipy import fft, ndimage, signal
 
 #: longest segment of a frequency response [samples]
 SEGMENT = 8192
-#: a response of any motion keeps points of at most this relative standard deviation
+#: largest relative standard deviation of a point of a response to arbitrary motion
 TRUSTED = 0.1
-#: below this the slow part of a signal is taken away [Hz]
+#: corner below which the slow part of a signal is removed [Hz]
 HIGH_PASS = 30.0
-#: time over which the size of fast motion is taken [s]
+#: averaging time of the size of fast motion [s]
 WINDOW = 0.1
-#: fewer points are no response, but that of a few sines
+#: smallest number of points of a response: fewer points come from a few sines
 POINTS = 20
 
 
 def excited_band(u: Array, sample_rate: float, depth: float = 1e-3) -> float:
     """
-    Return the highest frequency at which the input still has power [Hz].
+    Find the highest frequency at which the input still has power [Hz].
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def excited_band(u: Array, sample_rate: float, depth: float = 1e-3) -> float:
 
 
 def prefilter(x: Array, sample_rate: float, cutoff: float) -> Array:
-    """Return x without its mean and without what lies above the cut-off; shape (n,)."""
+    """Remove the mean and the frequencies above the cut-off from x; shape (n,)."""
     centred = np.asarray(x - x.mean())
     if cutoff >= 0.45 * sample_rate:
         return centred
@@ -73,7 +73,7 @@ class FrequencyResponse:
     coherence : ndarray, shape (n,)
         ``|S_uy|^2 / (S_uu S_yy)``.
     std : ndarray, shape (n,)
-        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))`` of L segments.
+        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))`` for L segments.
     """
 
     frequency: Array
@@ -82,7 +82,7 @@ class FrequencyResponse:
     std: Array
 
     def at(self, kept: Mask) -> FrequencyResponse:
-        """Return the response at some of its frequencies."""
+        """Select some frequencies of the response."""
         names = ('frequency', 'response', 'coherence', 'std')
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
@@ -115,20 +115,20 @@ def broadband_response(
     parts: Sequence[tuple[Array, Array, Array]], sample_rate: float
 ) -> FrequencyResponse | None:
     """
-    Estimate the response of what follows a hysteresis from any motion.
+    Estimate the response from the output of a hysteresis to the displacement, from any motion.
 
     Parameters
     ----------
     parts : sequence of tuple of ndarray
-        Unbroken stretches, of any lengths: voltage, the same behind the hysteresis, displacement.
+        Unbroken stretches of any length: voltage, output of the hysteresis, displacement.
     sample_rate : float
         [Hz]
 
     Returns
     -------
     FrequencyResponse or None
-        From behind the hysteresis, at the frequencies at which voltage and displacement tell it;
-        None where these are hardly any, as with a single sine.
+        Response at the frequencies that both voltage and displacement show; None if these are
+        too few, as with a single sine.
     """
     longest = max((v.size for v, _, _ in parts), default=0)
     segment = min(_power_of_two(longest // 16), SEGMENT)
@@ -137,9 +137,9 @@ def broadband_response(
         return None
     driven = _response([(v, y) for v, _, y in parts], segment, sample_rate)
     response = _response([(w, y) for _, w, y in parts], segment, sample_rate)
-    # what a hysteresis adds where the voltage has nothing tells of its model alone
+    # a hysteresis adds frequencies without voltage there, which would only tell of its own model
     told = np.maximum(driven.std, response.std) <= TRUSTED
-    # a Hann window blurs what lies within two bins of the trend that was taken out
+    # a Hann window blurs the lowest two bins, next to the trend that was removed
     told[:3] = False
     return response.at(told) if told.sum() >= POINTS else None
 
@@ -166,7 +166,7 @@ def _response(
 
 
 def highest_frequency(u: Array, rate: float) -> float:
-    """Return the frequency [Hz] below which all but a millionth of the moving power lies."""
+    """Find the frequency [Hz] below which all but a millionth of the power of u - mean lies."""
     du = np.diff(u)
     if du.size == 0:
         return 0.0
@@ -184,7 +184,7 @@ def highest_frequency(u: Array, rate: float) -> float:
 
 
 def high_passed(x: Array, rate: float) -> Array:
-    """Return a signal above `HIGH_PASS`; all but its start where the rate is too low for that."""
+    """High-pass a signal at `HIGH_PASS`, or only subtract its start if the rate is too low."""
     if 4.0 * HIGH_PASS > rate:
         return np.asarray(x - x[0])
     sos = signal.butter(2, HIGH_PASS, btype='highpass', fs=rate, output='sos')
@@ -192,12 +192,12 @@ def high_passed(x: Array, rate: float) -> Array:
 
 
 def rms_above(u: Array, rate: float, edge: float) -> Array:
-    """Return the rms above a frequency around each sample, shape (n,)."""
+    """Compute the rms above a frequency around each sample, shape (n,)."""
     if 4.0 * edge > rate:
         return np.zeros(u.size)
     width = max(1, int(WINDOW * rate))
     sos = signal.butter(2, edge, btype='highpass', fs=rate, output='sos')
-    # both ways, with the ends turned over: a record that starts on the move does not jump there
+    # filter both ways with mirrored ends, so that a record that starts in motion does not jump
     pad = min(u.size - 1, int(3.0 * rate / edge))
     power = ndimage.uniform_filter1d(signal.sosfiltfilt(sos, u, padlen=pad) ** 2, width)
     return np.asarray(np.sqrt(np.maximum(power, 0.0)))
@@ -214,9 +214,9 @@ class NoiseSegment:
 
 def noise_segment(run: Run, signal: Array, start: int, stop: int) -> NoiseSegment:
     """
-    Return the noise between two samples, its input replaced by a signal.
+    Cut out the noise between two samples, with a signal in place of its input.
 
-    Noise in which nothing moves raises IdentificationError.
+    Raises IdentificationError if the voltage or the displacement is constant there.
     """
     rate = run.piece.sample_rate
     if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
@@ -230,16 +230,16 @@ def noise_segment(run: Run, signal: Array, start: int, stop: int) -> NoiseSegmen
 
 
 def band_of(run: Run, start: int, stop: int) -> float:
-    """Return up to which frequency the voltage moves between two samples [Hz]."""
+    """Find the highest frequency of the voltage between two samples [Hz]."""
     u = run.u[start:stop]
     return excited_band(u - u.mean(), run.piece.sample_rate)
 
 
 def longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
     """
-    Return the longest unbroken noise: its run, first sample and the one behind the last.
+    Find the longest unbroken noise: its run, its first sample and the sample behind its last.
 
-    Where it is too short it raises IdentificationError.
+    Raises IdentificationError if it is too short.
     """
     found = [
         (stop - start, run, start, stop)

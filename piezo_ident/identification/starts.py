@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The unknown memory of runs that do not start at the lowest voltage, together with their plays.
+Fit the unknown memory of runs that do not start at the lowest voltage, together with the plays.
 
-Until the voltage has moved by the width of a play, the play may stand still at an unknown place,
-so nothing of a run has to be thrown away: the places are fitted with the weights.  The outputs of
-all plays are one curve over the threshold, which starts at the voltage and nowhere rises or falls
-faster than the threshold grows,
+Until the voltage has moved by the width of a play, the play may stand still at an unknown place.
+The places are fitted with the weights, so no part of a run has to be dropped.  The outputs of all
+plays are one curve over the threshold.  The curve starts at the voltage and falls no faster than
+the threshold grows,
 
-    F_r(0) = u(0) - int_0^r s(r') dr',      0 <= s <= 1,
+    F_r(0) = u(0) - int_0^r s(r') dr',      0 <= s <= 1.
 
-so the shares s are what is sought.  Gauss-Newton on the weights and the shares, both bounded.
+The fit finds the shares s.  Gauss-Newton varies the weights and the shares, both bounded.
 """
 
 from __future__ import annotations
@@ -30,34 +30,36 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.play import play_columns
 
 Rule = Callable[[Array], Array]
-#: of each run whose start is sought: the share of each play
+#: share of each play, by the number of the run whose start is fitted
 Shares = dict[int, Array]
 
-#: blocks into which a run is thinned; of each, the extremes and the last sample stay
+#: number of blocks into which a run is thinned; each keeps its extremes and its last sample
 BLOCKS = 4000
-#: thresholds over the range of the voltage, fewer where there are several unknown starts
+#: number of thresholds over the range of the voltage, for one or two unknown starts and for more
 COUNT, COUNT_OF_MANY = 40, 20
-#: shares of the swing by which the voltage may have gone one way to a start, the first guesses;
-#: from a wrong one Gauss-Newton ends at another, worse memory
+#: first guesses: shares of the swing that the voltage has moved in one direction up to the start.
+#: From a wrong guess Gauss-Newton ends at another, worse memory
 TURNED = np.linspace(0.0, 1.0, 11)
-#: shares, the same for all plays, of a stage that stands between
+#: first guesses: one share for all plays, of a stage that stands between its branches
 BETWEEN = (0.5, 0.25, 0.75)
-#: shares of plays that were pushed to an end: from the very end none would move
+#: shares of plays at their upper and lower end; a play exactly at its end would not move in the
+#: fit
 ENDS = (0.1, 0.9)
-#: best guesses from which Gauss-Newton starts
+#: number of best guesses from which Gauss-Newton starts, beside the plain guess
 STARTS = 5
-#: share by which they must err less than the plain one: a record of steps alone tells nothing
+#: share by which another start must err less than the plain start: a record of steps alone cannot
+#: tell the memory
 CLEARLY = 0.02
-#: weight of the first guess of the shares, per row and threshold
+#: weight that pulls the shares to the first guess, per row and threshold
 PULL = 1e-3
-#: most turns
+#: most iterations
 TURNS = 12
-#: smallest fall of the loss that is worth another turn, as a share of it
+#: smallest fall of the loss that is worth another iteration, as a share of the loss
 WORTH = 1e-3
 
 
 class _Thinned:
-    """A run by its extremes: plays depend on nothing else."""
+    """Run thinned to its extremes, which alone move the plays."""
 
     def __init__(self, excerpt: Excerpt, lag: float) -> None:
         u, n = excerpt.u, excerpt.u.size
@@ -76,7 +78,7 @@ class _Thinned:
         self.top, self.bottom = np.maximum.accumulate(self.u), np.minimum.accumulate(self.u)
 
     def columns(self, r: Array, memory: Array) -> tuple[Array, Array]:
-        """Return the plays at the rows, and 1 where a play still stands at its start."""
+        """Compute the plays at the rows, and 1 if a play still stands at its start, else 0."""
         plays = play_columns(self.u, r, memory)[:, self.rows]
         top, bottom = self.top[self.rows], self.bottom[self.rows]
         at, width = memory[:, None], r[:, None]
@@ -86,9 +88,9 @@ class _Thinned:
 
 def _guesses(r: Array, swing: float) -> list[Array]:
     """
-    Return shares of a stage that last went up, or down, by some voltage, or stands between.
+    Guess shares for a stage that last went up or down by some voltage, or stands between.
 
-    The first, in the middle, is the plain one.
+    The first guess is the plain one, with all shares in the middle.
     """
     low, high = ENDS
     up = [np.where(r < share * swing, high, low) for share in TURNED]
@@ -98,10 +100,9 @@ def _guesses(r: Array, swing: float) -> list[Array]:
 
 class _Starts:
     """
-    Runs of which some start with an unknown memory, and least squares on weights and starts.
+    Least squares on the weights and the unknown starts of runs.
 
-    Offsets and weights come first among the numbers that are sought, the shares of each start
-    behind them.
+    The vector of unknowns holds offsets and weights first, then the shares of each start.
     """
 
     def __init__(
@@ -122,13 +123,13 @@ class _Starts:
         self.lower[self.weights] = 0.0
 
     def memory(self, i: int, shares: Shares) -> Array:
-        """Return the memory at the start of a run."""
+        """Compute the memory at the start of a run."""
         if i in shares:
             return np.asarray(self.excerpts[i].u[0] - np.cumsum(shares[i] * self.steps))
         return self.excerpts[i].start(self.r)
 
     def rows(self, i: int, shares: Shares) -> tuple[Array, Array]:
-        """Return columns of offsets and weights with the target, and which plays still stand."""
+        """Compute columns of offsets and weights with the target, and the plays that stand."""
         part = self.thinned[i]
         plays, still = part.columns(self.r, self.memory(i, shares))
         u = part.u[part.rows]
@@ -139,12 +140,12 @@ class _Starts:
         return block, still
 
     def weighted(self, blocks: Sequence[Array]) -> tuple[Array, float]:
-        """Return offsets and weights for rows of all runs, or their factors, and the loss."""
+        """Fit offsets and weights to rows of all runs, or to their factors; also the loss."""
         R = triangular_factor(blocks, self.known + 1)
         return bounded_least_squares(R, self.lower, self.upper)
 
     def again(self) -> list[tuple[Shares, Array]]:
-        """Return the memories that were found before with another G, if there are, as guesses."""
+        """Turn memories that were found before with another G into first guesses, if all exist."""
         before = {i: rule for i in self.sought if (rule := self.excerpts[i].memory) is not None}
         if len(before) < len(self.sought):
             return []
@@ -158,7 +159,7 @@ class _Starts:
         return [(shares, self.weighted(blocks)[0])]
 
     def guessed(self) -> list[tuple[Shares, Array]]:
-        """Return the plain guess and the best others, and the weights that go with each."""
+        """Find the plain guess and the best other guesses, each with its weights."""
         guesses = _guesses(self.r, self.swing)
         factors = [
             [
@@ -186,7 +187,7 @@ class _Starts:
         return found
 
     def step(self, shares: Shares, weights: Array, prior: Shares) -> tuple[Array, Shares, float]:
-        """Return the next weights, changes of the shares, and the loss before."""
+        """Compute the next weights, the changes of the shares, and the loss before the step."""
         known, m = self.known, self.r.size
         width = known + m * len(self.places) + 1
         blocks = []
@@ -212,7 +213,7 @@ class _Starts:
         return theta[:known], {i: theta[at] for i, at in self.places.items()}, loss
 
     def fit(self, first: tuple[Shares, Array]) -> tuple[Shares, float]:
-        """Return the shares that Gauss-Newton finds from a guess, and their loss."""
+        """Run Gauss-Newton from a guess; the shares and their loss."""
         prior, weights = first
         best, best_loss, scale = prior, np.inf, 1.0
         shares, change = prior, prior
@@ -236,22 +237,22 @@ def fit_starts(
     excerpts: Sequence[Excerpt], unknown: Sequence[bool], lag: float = 0.0
 ) -> list[Rule | None]:
     """
-    Return the memory at the start of each run as a function of the thresholds.
+    Find the memory at the start of each run as a function of the thresholds.
 
     Parameters
     ----------
     excerpts : sequence of Excerpt
-        Runs with the samples to use, at best slow ones; each gets an offset.  A memory that was
-        found before is the first guess.
+        Runs with the samples to use, preferably slow motion; each gets an offset.  A memory that
+        was found before is the first guess.
     unknown : sequence of bool
-        Whose memory is sought; the others keep theirs.
+        Whether the memory of a run is fitted; the other runs keep theirs.
     lag : float, optional
-        Samples by which the displacement follows slow motion: the delay and that of G.
+        Samples by which the displacement follows slow motion, through the delay and G.
 
     Returns
     -------
     list of callable or None
-        `Excerpt.memory` of each.
+        `Excerpt.memory` of each run.
     """
     rules = [e.memory for e in excerpts]
     if not any(unknown):
@@ -271,7 +272,7 @@ def fit_starts(
 
 
 def lag_of(G: Dynamics, delay: Delay) -> float:
-    """Return by how many samples the displacement follows slow motion."""
+    """Compute the number of samples by which the displacement follows slow motion."""
     a = np.concatenate([[1.0], G.a])
     k_b, k_a = np.arange(G.b.size), np.arange(a.size)
     return delay.total + float(k_b @ G.b / G.b.sum() - k_a @ a / a.sum())
@@ -279,10 +280,9 @@ def lag_of(G: Dynamics, delay: Delay) -> float:
 
 def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
     """
-    Return the runs with the memory at their start, found on what is fitted of their triangles.
+    Fit the memory at the start of runs to the fitted samples of their triangles.
 
-    Those that do not start at the lowest voltage are known all over then; `lag` as for
-    `fit_starts`.
+    All samples of a run count as known once its memory is fitted.  `lag` is as in `fit_starts`.
     """
     excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
     driven = [i for i, e in enumerate(excerpts) if e.use.any()]

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 1: the pure delay, from steps, checked against a scan of the ARX loss.
+Step 1: find the pure delay from steps, and check it by a scan of the ARX loss.
 
-All step responses are turned the same way, scaled and averaged; the delay is the first sample at
-which the average leaves the noise.  The scan asks the same of the noise record: the largest delay
-that does not cost loss.
+The step responses are divided by the signed height of their steps and averaged.  The delay is the
+first sample at which the average leaves the noise.  The scan fits ARX models with every delay to
+the noise record.  Its delay is the largest that does not raise the loss.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from piezo_ident.record.record import Piece
 
 #: the average response counts as risen at this many standard deviations of its noise
 THRESHOLD = 5.0
-#: rise over the smallest loss, as a share of it, that counts as none
+#: losses within this share of the smallest loss count as equal to it
 EQUAL = 0.02
-#: delays [samples] that a scan of the loss tries, and its na and nb
+#: number of delays [samples] that the scan tries, and the orders na = nb of its models
 MAX_DELAY, SCAN_ORDER = 30, 8
 
 
 @dataclass(frozen=True, eq=False)
 class StepDelay:
     """
-    Delay found from steps.
+    Delay read from steps.
 
     Attributes
     ----------
     samples : int or None
-        Delay d; None when no response rose above the noise.
+        Delay d; None if no response rose above the noise.
     std : float
-        Standard deviation over repeats [samples]: each repeat left out once (jackknife), at
-        least the resolution of the sampling clock, 1/sqrt(12).
+        Standard deviation over repeats [samples], by leaving out each repeat once (jackknife).
+        The resolution of the sampling clock, 1/sqrt(12), is its smallest value.
     repeats : int
         Number of steps averaged.
     noise : float
@@ -59,10 +59,10 @@ class StepDelay:
 
 def find_jumps(v: Array, before: int, after: int) -> Integers:
     """
-    Return the samples at which v jumps out of a quiet stretch.
+    Find the samples at which v jumps after a quiet stretch.
 
-    A jump is a difference that exceeds a quarter of the largest one, and twenty times every
-    difference within `before` samples ahead of it.
+    A jump is a difference of neighbouring samples.  It exceeds a quarter of the largest
+    difference, and twenty times every difference within the `before` samples ahead of it.
 
     Parameters
     ----------
@@ -98,10 +98,10 @@ def step_responses(
     pieces: Sequence[Piece], before: int = 100, after: int = 60
 ) -> tuple[Array, Array]:
     """
-    Return the step responses [m/V], one a row, and the height of each step [V].
+    Cut out the step responses [m/V], one a row, and the height of each step [V].
 
-    They reach from `before` samples ahead of each step to `after` behind it: shapes (repeats,
-    before + after) and (repeats,).  A lost reading is NaN.
+    A response reaches from `before` samples ahead of its step to `after` samples behind it.  The
+    shapes are (repeats, before + after) and (repeats,).  A lost reading is NaN.
     """
     rows, heights = [], []
     for piece in pieces:
@@ -112,7 +112,7 @@ def step_responses(
             rest = np.flatnonzero(np.isfinite(y[:before]))
             if rest.size < 3:
                 continue
-            # the stage may still be settling; what it did before the step goes on under it
+            # a stage that still settles before the step goes on settling under the response
             line = np.polynomial.Polynomial.fit(rest, y[rest], 1, domain=[0, before - 1])
             rows.append((y - line(np.arange(before + after))) / height)
             heights.append(abs(height))
@@ -120,7 +120,7 @@ def step_responses(
 
 
 def _mean(responses: Array, weight: Array) -> Array:
-    """Return the weighted mean of step responses at each lag, of the readings that are known."""
+    """Average step responses at each lag with weights, over the known readings."""
     known = np.isfinite(responses)
     total = weight @ known
     sums = weight @ np.where(known, responses, 0.0)
@@ -129,11 +129,11 @@ def _mean(responses: Array, weight: Array) -> Array:
 
 def _first_rise(mean: Array, before: int, rounding: float) -> tuple[int | None, float, float]:
     noise = float(np.std(mean[:before], ddof=2))
-    # a quantised, noise-free record still has its last digit
+    # a quantised, noise-free record still has the rounding of its last digit
     threshold = THRESHOLD * max(noise, rounding, 1e-6 * float(np.abs(mean[before:]).max()))
     sign = np.sign(mean[before:].sum())
     risen = sign * mean[before:] > threshold
-    # one sample may be chance, two in a row are not
+    # one sample above the threshold may be chance, two in a row are not
     both = np.flatnonzero(risen[:-1] & risen[1:])
     return (int(both[0]) if both.size else None), noise, threshold
 
@@ -152,7 +152,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     Returns
     -------
     StepDelay
-        With ``samples=None`` when there is no step, or none that rises above the noise.
+        Its `samples` are None unless a step rises above the noise.
 
     Examples
     --------
@@ -163,14 +163,14 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     responses, heights = step_responses(pieces, before, after)
     lag = np.arange(-before, after)
     n = heights.size
-    # two samples and a line through them tell no noise
+    # two samples and a line through them leave no residual, hence no noise
     if n == 0 or before < 3:
         empty = np.zeros(before + after)
         return StepDelay(None, float('inf'), 0, float('nan'), float('nan'), lag, empty)
-    # the noise of a response in m/V falls with its height, so weights go with the square of it
+    # the noise of a response in m/V falls with the height of its step, so the weight is its square
     weight = heights**2 / np.sum(heights**2)
     mean = _mean(responses, weight)
-    # what taking out a line leaves of a displacement that never moves
+    # rounding that remains after a line is taken out of a constant displacement
     largest = max(float(np.abs(piece.y).max()) for piece in pieces)
     rounding = 1e-12 * largest / float(heights.max())
     samples, noise, threshold = _first_rise(mean, before, rounding)
@@ -193,7 +193,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
 
 
 def no_step(step: StepDelay | None) -> str:
-    """Say why no step tells the delay: there is none, or none that rises above the noise."""
+    """Say why no step tells the delay: no step exists, or no step rises above the noise."""
     if step is None or not step.repeats:
         return 'there are no steps out of a rest'
     return 'no step rises above the sensor noise'
@@ -201,10 +201,10 @@ def no_step(step: StepDelay | None) -> str:
 
 def delay_from_loss(loss: Array) -> int | None:
     """
-    Return the delay that a scan of the ARX loss points to.
+    Read the delay from a scan of the ARX loss.
 
-    A model with a smaller delay contains the one with the true delay as long as it has enough
-    numerator coefficients, so the loss stays low up to the true delay and rises behind it.
+    A model with too small a delay contains the true model if it has enough numerator
+    coefficients.  The loss therefore stays low up to the true delay and rises behind it.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def delay_from_loss(loss: Array) -> int | None:
     Returns
     -------
     int or None
-        None when the loss has not risen at the largest delay tried: then it tells nothing.
+        None if the loss has not risen at the largest delay: the scan is then undecided.
 
     Examples
     --------

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 2: ARX dynamics of every order from one factorisation, and instrumental variables.
+Step 2: fit ARX dynamics of every order from one factorisation, and refine by instruments.
 
     y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j u(k-d-j+1) + e(k)             (eqs. 4-5)
 
-The data matrix of the largest order is reduced once to its triangular factor R, a few dozen rows.
-Every smaller order, and every delay, is a choice of columns of R:
+The data matrix of the largest order is reduced once to its triangular factor R of a few dozen
+rows.  A smaller order or another delay is a choice of columns of R:
 
         [ y(k-1) .. y(k-na_max) | u(k) .. u(k-d_max-nb_max+1) | y(k) ]   =   Q R
 """
@@ -26,11 +26,12 @@ from piezo_ident.identification.solvers.output_error import lag_products
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from scipy.linalg import solve_triangular
 
-#: what is left of a column of unit length, once those before it are taken off, must be more
+#: a column counts as independent if it keeps more than this share of its length once the columns
+#: before it are projected out
 INDEPENDENT = 1e-10
-#: poles that are mirrored into the circle come to lie within
+#: largest radius of a pole that was mirrored into the unit circle
 RADIUS = 0.9995
-#: refinements by instrumental variables
+#: number of refinements by instrumental variables
 REFINEMENTS = 3
 
 
@@ -42,11 +43,11 @@ class ArxFactor:
     Attributes
     ----------
     R : ndarray, shape (p, p)
-        ``p = na_max + n_lags + 1``; columns as in the module's drawing.
+        ``p = na_max + n_lags + 1``; the columns are those of the drawing in the module.
     n : int
-        Number of rows that went in.
+        Number of rows of the data matrix.
     na_max : int
-        Lags of the output; those of the input come behind them, from lag 0 on.
+        Number of lags of the output.  The lags of the input follow them, from lag 0 on.
     """
 
     R: Array
@@ -54,7 +55,7 @@ class ArxFactor:
     na_max: int
 
     def _columns(self, na: int, nb: int, d: int) -> tuple[Array, Array]:
-        # those of an order, and their lengths
+        # columns of the order, and their lengths
         A = self.R[:, [*range(na), *range(self.na_max + d, self.na_max + d + nb)]]
         scale = np.linalg.norm(A, axis=0)
         scale[scale == 0.0] = 1.0
@@ -64,8 +65,8 @@ class ArxFactor:
         """
         Solve one order by least squares.
 
-        Return a_1 .. a_na, b_1 .. b_nb in one row, and the mean square of the one-step prediction
-        error.
+        The solution is a_1 .. a_na, b_1 .. b_nb in one row, with the mean square of the one-step
+        prediction error.
         """
         (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
         x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
@@ -75,11 +76,11 @@ class ArxFactor:
         return theta, loss
 
     def losses(self, order: int, delays: int) -> Array:
-        """Return the one-step loss of na = nb = `order` for so many delays from 0 on."""
+        """Compute the one-step loss of na = nb = `order` for the first `delays` delays."""
         return np.array([self.fit(order, order, d)[1] for d in range(delays)])
 
     def dynamics(self, na: int, nb: int, d: int) -> Dynamics:
-        """Return one order by least squares, possibly unstable."""
+        """Fit one order by least squares; the dynamics may be unstable."""
         theta, _ = self.fit(na, nb, d)
         return Dynamics(a=theta[:na], b=theta[na:])
 
@@ -87,8 +88,8 @@ class ArxFactor:
         """
         Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
 
-        The results are those of `fit`, which is asked where the data do not tell the columns
-        apart.
+        Each result equals the result of `fit`, which is called instead if the data cannot tell
+        the columns apart.
         """
         A, scale = self._columns(na, nb_max, d)
         both = np.column_stack([A / scale, self.R[:, -1]])
@@ -110,8 +111,8 @@ def arx_factor(u: Array, y: Array, na_max: int, n_lags: int) -> ArxFactor:
     """
     Reduce input and output to the triangular factor of their lags.
 
-    u and y, shape (n,), are without their means; the lags are 1 .. na_max of y and 0 .. n_lags - 1
-    of u.  Fewer samples than lags raise IdentificationError.
+    u and y, shape (n,), have no mean.  The lags are 1 .. na_max of y and 0 .. n_lags - 1 of u.
+    Raises IdentificationError if the samples are fewer than twice the columns.
     """
     first = max(na_max, n_lags - 1)
     n = y.size - first
@@ -135,7 +136,7 @@ def arx_factor(u: Array, y: Array, na_max: int, n_lags: int) -> ArxFactor:
 
 
 def factor_of(parts: Sequence[tuple[Array, Array]], na_max: int, n_lags: int) -> ArxFactor:
-    """Reduce stretches of input and output, none of them too short, to one triangular factor."""
+    """Reduce several stretches of input and output, each long enough, to one triangular factor."""
     factors = [arx_factor(u, y, na_max, n_lags) for u, y in parts]
     R = triangular_factor([factor.R for factor in factors], na_max + n_lags + 1)
     return ArxFactor(R, sum(factor.n for factor in factors), na_max)
@@ -144,16 +145,16 @@ def factor_of(parts: Sequence[tuple[Array, Array]], na_max: int, n_lags: int) ->
 @dataclass(frozen=True, eq=False)
 class OrderTable:
     """
-    Every order side by side; arrays have shape (na_max, nb_max), entry [na-1, nb-1].
+    Table of all orders; arrays have shape (na_max, nb_max) with entry [na-1, nb-1].
 
     Attributes
     ----------
     loss : ndarray
-        One-step loss on the fitted part.
+        One-step loss on the fitted samples.
     aic, bic : ndarray
-        Akaike's and Schwarz's criterion.
+        Criteria of Akaike and of Schwarz.
     held_out : ndarray
-        Free-run rms error on the held-out part, infinite for an unstable model.
+        Free-run rms error on the held-out samples; infinite for an unstable model.
     """
 
     loss: Array
@@ -162,13 +163,17 @@ class OrderTable:
     held_out: Array
 
     def best(self, criterion: str) -> tuple[int, int]:
-        """Return (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
+        """Give (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
         table = getattr(self, criterion)
         i, j = np.unravel_index(int(np.argmin(table)), table.shape)
         return int(i) + 1, int(j) + 1
 
     def ranked(self, slack: float = 0.0) -> list[tuple[int, int]]:
-        """Return the orders by held-out error, rounded up in steps of `slack`, then by size."""
+        """
+        Sort the stable orders by held-out error, then by size.
+
+        Errors within the same step of `slack`, relative to the best, count as equal.
+        """
         order = []
         best = float(self.held_out.min())
         for i, j in np.ndindex(self.held_out.shape):
@@ -181,15 +186,15 @@ class OrderTable:
 
 
 def delayed(u: Array, d: int) -> Array:
-    """Return a signal delayed by whole samples, zeros first; shape (n,)."""
+    """Delay a signal by whole samples, with zeros first; shape (n,)."""
     return np.concatenate([np.zeros(d), u[: u.size - d]])
 
 
 def free_run_error(model: Dynamics, d: int, u: Array, y: Array, first: int | None = None) -> float:
     """
-    Return the rms free-run error but for an offset, infinite for an unstable model.
+    Compute the rms free-run error around its mean; infinite for an unstable model.
 
-    What comes before the `first` sample, or a fifth of all, is left for the transient.
+    Samples before `first` (a fifth of them by default) are left to the transient.
     """
     if not model.is_stable:
         return float('inf')
@@ -206,10 +211,10 @@ def scan_orders(
     tick: Callable[[float], None] = lambda share: None,
 ) -> OrderTable:
     """
-    Fit all orders up to (na_max, nb_max), and judge each by free run on held-out data.
+    Fit all orders up to (na_max, nb_max), and judge each by its free run on held-out data.
 
-    The data were not fitted; d is the delay [samples].  `tick` is called with the share of the
-    work done, and may raise to stop it.
+    The factor holds the fitted data, `u_held` and `y_held` the other data; d is the delay
+    [samples].  `tick` is called with the share of the work done, and may raise to stop it.
     """
     shape = (factor.na_max, nb_max)
     loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
@@ -227,7 +232,7 @@ def scan_orders(
 
 
 def stabilised(dynamics: Dynamics) -> Dynamics:
-    """Return the dynamics with poles outside the circle mirrored into it, same static gain."""
+    """Mirror poles outside the unit circle into it, and keep the static gain."""
     poles = dynamics.poles
     if poles.size == 0 or np.abs(poles).max() < 1.0:
         return dynamics
@@ -247,7 +252,7 @@ _Lags = tuple[Array, int, float, int]
 
 
 def _inner(one: _Lags, other: _Lags, n: int) -> Array:
-    """Return the sums of products of two groups of lags, each (signal, first row, sign, lags)."""
+    """Sum the products of two groups of lags, each given as (signal, first row, sign, lags)."""
     (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
     return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
 
@@ -256,30 +261,30 @@ def instrumental_variables(u: Array, y: Array, start: Dynamics, d: int) -> Dynam
     """
     Refine an ARX model by instrumental variables.
 
-    Instruments are the lags of the input and of the simulated output; data and instruments are
-    filtered by 1/A of the model before, which removes the bias that output noise gives to least
-    squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
+    The instruments are the lags of the input and of the simulated output.  Data and instruments
+    are filtered by 1/A of the previous model.  This removes the bias that output noise gives to
+    least squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
 
     Parameters
     ----------
     u, y : ndarray, shape (n,)
-        Without their means.
+        Input and output without their means.
     start : Dynamics
-        Least-squares model; made stable first.
+        Least-squares model; it is made stable first.
     d : int
         Delay [samples].
 
     Returns
     -------
     Dynamics
-        Possibly unstable: the caller judges.
+        Refined model, possibly unstable: the caller judges.
     """
     part = Excerpt(delayed(u, d), y, np.ones(u.size, dtype=bool))
     return instruments_of([part], start)
 
 
 def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
-    """Refine an ARX model by instrumental variables, from the samples that count of excerpts."""
+    """Refine an ARX model by instrumental variables from the samples of excerpts that count."""
     na, nb = start.a.size, start.b.size
     model = stabilised(start)
     first = max(na, nb)
@@ -309,6 +314,6 @@ def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
 
 
 def _filtered(e: Excerpt, model: Dynamics) -> list[Array]:
-    """Return displacement, input and simulated output, filtered by 1/A."""
+    """Filter displacement, input and simulated output by 1/A."""
     y_sim = filter_arx(model.a, model.b, e.u, at_rest=False)
     return [filter_arx(model.a, np.ones(1), x, at_rest=False) for x in (e.x, e.u, y_sim)]

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 3: which law of H, and which thresholds, by data that were not fitted.
+Step 3: choose the law of H and its thresholds by data that were not fitted.
 
-The law is chosen by motion of another kind: the record is cut into a few long parts, so that each
-is another stretch of sweeps, steps or noise, and each part is predicted from all others.  Sums of
-plays stay unless a wider law errs clearly less there.  On loops that no wider law describes
-either, a wider law fits a little better and predicts worse.
+The record is cut into a few long parts, so that each part holds other sweeps, steps or noise.
+Each part is predicted from all other parts.  The plain sum of plays stays unless a wider law has a
+clearly smaller error on the predicted parts.  The error of the fit itself would mislead: on loops
+that no law describes, a wider law fits slightly better and predicts worse.
 """
 
 from __future__ import annotations
@@ -31,31 +31,32 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
-#: plays of the paper, where the data cannot choose their number
+#: number of plays in the paper, used if the data cannot choose their number
 PAPER_COUNT = 10
 #: numbers of evenly spaced thresholds that are tried, one after the other
 COUNTS = (10, 14, 20, 28, 40, 56, 80)
-#: a larger number must lower the held-out error by this share
+#: share by which a larger number must lower the held-out error
 GAIN = 0.01
-#: thresholds below the smallest that small motion may ask for
+#: number of thresholds that small motion may add below the smallest
 SMALL = 4
-#: thresholds of a wider law, and parts of the record that are predicted in turn
+#: number of operators of a wider law, and number of parts of the record that are predicted in turn
 FINE, PARTS = 40, 8
-#: share by which a wider law must lower the error of the parts: on loops of the kinds of Bouc and
-#: Wen and of Duhem wrong laws lowered it by up to 17 %, on Preisach loops the right one by 60 to
-#: 95 %
+#: share by which a wider law must lower the error of the parts.  On loops of the kinds of Bouc and
+#: Wen and of Duhem, wrong laws lowered the error by up to 17 %; on Preisach loops the right law
+#: lowered it by 60 to 95 %
 WORTH = 0.25
-#: error that it may leave on small motion, in parts of what plays leave; lags along the path have
-#: to be worth as much there, too (6 to 27 % on their own kinds of loops, 84 % under creep)
+#: largest error of a wider law on small motion, relative to the error of plays.  A law with lags
+#: along the path must instead lower the error by `WORTH` there, too (its error was 6 to 27 % on
+#: its own kinds of loops, and 84 % under creep)
 NO_WORSE = 1.1
 
 
 def merged(hysteresis: Hysteresis) -> Array:
     """
-    Return fewer thresholds in better places, from a fit on a fine grid.
+    Merge the thresholds of a fit on a fine grid into fewer thresholds in better places.
 
     On a grid finer than the truth, least squares puts a weight on the two neighbours of each true
-    threshold and zero elsewhere; each such group becomes one threshold at its centre of weight.
+    threshold and zero elsewhere.  Each such pair becomes one threshold at its centre of weight.
 
     Examples
     --------
@@ -99,11 +100,11 @@ def choose_thresholds(
     """
     Refine the thresholds until the held-out error stops falling.
 
-    The grid grows; at each size the plays that least squares left without weight are dropped and
-    neighbours merged, and the merged set is kept where it does no worse.  `fit` and `held` are the
-    same runs in the same order with the fitted and the held-out samples, `swing` is the excited
-    range of the normalised voltage.  `tick` is called with the share of the work done, and may
-    raise to stop it.
+    The grid grows.  At each size the plays without weight are dropped, neighbours are merged, and
+    the merged thresholds replace the grid if their held-out error is as small.  `fit` and `held`
+    are the same runs in the same order with the fitted and the held-out samples.  `swing` is the
+    excited range of the normalised voltage.  `tick` is called with the share of the work done,
+    and may raise to stop it.
     """
     best = even_thresholds(swing, COUNTS[0])
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)
@@ -115,7 +116,7 @@ def choose_thresholds(
         candidates = [(loss, even)]
         if 1 < places.size < even.size:
             candidates.append((_held_loss(fit, held, places, dynamics, delay)[0], places))
-        # the fewer thresholds win a tie
+        # fewer thresholds win a tie
         loss, thresholds = min(
             candidates, key=lambda c: (c[0] * (1 + 1e-3 * c[1].size), c[1].size)
         )
@@ -136,16 +137,16 @@ def with_small(
     delay: Delay,
 ) -> Array:
     """
-    Return thresholds with smaller ones, each half of the next, where small motion needs them.
+    Add small thresholds if the small motion needs them; each is half of the next.
 
-    A triangle over the whole range hardly tells how a small loop opens; steps and noise move in
-    such loops.  The excerpts `small` of such motion judge what is fitted to `fit`.
+    A triangle over the whole range hardly shows how a small loop opens.  Steps and noise move in
+    small loops, so the excerpts `small` of such motion judge the fit to `fit`.
     """
     finer = np.concatenate([thresholds[0] / 2.0 ** np.arange(SMALL, 0, -1), thresholds])
 
     def error(r: Array) -> float:
         h = fit_hysteresis(factorise(fit, r, dynamics, delay), r).hysteresis
-        # the rows below the offsets know nothing of them
+        # the rows below the offsets are free of the offsets
         R = factorise(small, h.thresholds, dynamics, delay)[len(small) :, len(small) :]
         return float(np.linalg.norm(R[:, :-1] @ [*h.weights, h.p1, h.p2] - R[:, -1]))
 
@@ -154,26 +155,30 @@ def with_small(
 
 @dataclass(frozen=True, eq=False)
 class Means(Excerpt):
-    """Fast motion, of which only means over rows are compared: what G leaves is not of H."""
+    """
+    Excerpt of fast motion, compared by means over rows.
+
+    A mean suppresses the error of G, which H cannot fit.
+    """
 
     @property
     def row(self) -> int:
-        """Samples that a row averages."""
+        """Number of samples that a row averages."""
         return max(1, min(int(self.use.sum()) // 1000, 50))
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
     """
-    The law that was chosen for H.
+    Choice of a law for H.
 
     Attributes
     ----------
     law : HysteresisLaw or None
-        None where sums of plays stay.
+        None if the plain sum of plays stays.
     errors : mapping of str to float
-        Of each law that was tried, the error of the parts predicted from all others: geometric
-        mean of their rms, normalised.
+        Error of each law that was tried, on parts predicted from all others: geometric mean of
+        their rms, normalised.
     """
 
     law: HysteresisLaw | None
@@ -190,8 +195,8 @@ def choose_law(
     """
     Choose the law of H by parts of the data that are predicted from all others.
 
-    `others` is small motion, on which a wider law must not err more than plays, and one with lags
-    must err less: what creeps follows a triangle of one speed as if it lagged along the path.
+    `others` is small motion.  A wider law must not err more there than plays, and a law with lags
+    must err less: under a triangle of one speed, creep looks like a lag along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
     low = min(e.span[0] for e in excerpts)
@@ -207,7 +212,7 @@ def choose_law(
     def fitted(R: Array, law: HysteresisLaw) -> HysteresisFit:
         return fit_hysteresis(_of(R, law, all_terms), law)
 
-    # no law can do better than all their columns with any weights
+    # the columns of all laws together, with free weights, are a lower bound for every law
     least = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=1e-10)[0]
     floor = float(np.sum((whole[:, :-1] @ least - whole[:, -1]) ** 2))
     if len(parts) < PARTS or floor > (1.0 - WORTH) ** 2 * fitted(whole, law_of['plays']).loss:
@@ -255,7 +260,7 @@ def _upper(difference: Array) -> float:
 def _parts(
     excerpts: Sequence[Excerpt], law: HysteresisLaw, dynamics: Dynamics, delay: Delay
 ) -> list[Array]:
-    """Return the factor of each part, with the columns of `factorise`."""
+    """Compute the factor of each part, with the columns of `factorise`."""
     total = sum(e.rows for e in excerpts)
     parts = []
     for e, rows in zip(excerpts, filtered_rows(excerpts, law, dynamics, delay), strict=True):
@@ -265,12 +270,12 @@ def _parts(
 
 
 def _but(parts: Sequence[Array], j: int) -> Array:
-    """Return the factor of all parts but one."""
+    """Combine the factors of all parts except part j."""
     return triangular_factor([R for i, R in enumerate(parts) if i != j], parts[j].shape[1])
 
 
 def _of(R: Array, law: HysteresisLaw, all_terms: HysteresisLaw) -> Array:
-    """Return the factor for one law, and the offsets there are, from that for all terms."""
+    """Select the columns of one law, and the used offsets, from a factor for all terms."""
     k = R.shape[1] - all_terms.size - 1
     offsets = np.flatnonzero(np.any(R[:, :k], axis=0))
     columns = [*offsets, *(k + law.within(all_terms)), R.shape[1] - 1]
@@ -280,9 +285,9 @@ def _of(R: Array, law: HysteresisLaw, all_terms: HysteresisLaw) -> Array:
 def _left_out(
     R: Array, coefficients: Array, law: HysteresisLaw, all_terms: HysteresisLaw
 ) -> float:
-    """Return the mean square of a part around its own offset."""
+    """Compute the mean square of a part around its own offset."""
     R = _of(R, law, all_terms)
-    # the rows below the offset know nothing of it
+    # the rows below the offset are free of the offset
     inner = R[R.shape[1] - law.size - 1 :, -law.size - 1 :]
     return float(np.sum((inner[:, :-1] @ coefficients - inner[:, -1]) ** 2))
 
@@ -298,11 +303,11 @@ def third_step(
     others: Sequence[Excerpt] = (),
 ) -> HysteresisFit:
     """
-    Find H: law and thresholds by held-out error unless their number is given, then the weights.
+    Find H: choose law and thresholds by held-out error, then fit the weights.
 
-    `fit` and `held` are the same runs in the same order with the fitted and the held-out samples;
-    `whole` is what the weights are fitted to in the end, `fit` when absent; `others` is small
-    motion, which can speak against a wider law.
+    A given number of thresholds is kept.  `fit` and `held` are the same runs in the same order
+    with the fitted and the held-out samples.  The final weights are fitted to `whole`, `fit` by
+    default.  `others` is small motion, which can reject a wider law.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit

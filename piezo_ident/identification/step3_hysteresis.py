@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 3: the weights of H, by bounded least squares, or by particle swarm as in the paper.
+Step 3: fit the weights of H by bounded least squares, or by particle swarm as in the paper.
 
-With thresholds and dynamics fixed, the output is linear in what is sought,
+With thresholds and dynamics fixed, the output is linear in the offset, q_i, p1 and p2:
 
-    y = offset + sum_i q_i (G F_ri[v]) + p1 (G v^3) + p2 (G v),        q_i >= 0,
+    y = offset + sum_i q_i (G F_ri[v]) + p1 (G v^3) + p2 (G v),        q_i >= 0.
 
-so the filtered plays are columns, and so are the terms of a wider law (`HysteresisLaw`).  They are
-reduced once to the triangular factor R, with the offsets in front; the rows below the offsets then
-hold the problem without them, and their Gram matrix is all that the swarm needs.
+The filtered plays are therefore columns of a regression, and so are the terms of a wider law
+(`HysteresisLaw`).  The columns are reduced once to the triangular factor R, with the offsets in
+front.  The rows of R below the offsets hold the problem without the offsets.  The swarm needs only
+the Gram matrix of these rows.
 """
 
 from __future__ import annotations
@@ -39,24 +40,24 @@ Solver = Literal['least_squares', 'swarm']
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
-#: a play that moves less than this share of what it is cannot be told from the offset
+#: a play that moves by less than this share of its size cannot be told from the offset
 STILL = 1e-8
-#: pull of lags along the path to zero, as a share of the size of the linear term
+#: weight that pulls lags along the path to zero, as a share of the size of the linear term
 PULL = 0.01
-#: what may be left of the start of G where the samples used begin
+#: remainder of the start of G at the first sample used
 FORGOTTEN = 1e-13
 
 
 def even_thresholds(swing: float, count: int) -> Array:
     """
-    Return `count` evenly spaced thresholds from 0 over the excited swing, without the 0.
+    Space thresholds evenly from 0 over the excited swing, without the 0.
 
     The play at r = 0 is the linear term, so `count` operators have ``count - 1`` thresholds.
 
     Raises
     ------
     IdentificationError
-        When there is no swing.
+        If there is no swing.
 
     Examples
     --------
@@ -73,10 +74,11 @@ def even_thresholds(swing: float, count: int) -> Array:
 
 def fine_thresholds(swing: float, excursion: float) -> Array:
     """
-    Return thresholds for an H that only serves to find G.
+    Space thresholds for a temporary H that only serves to find G.
 
-    Forty over the swing of the record, and a dozen within the excursion of the noise, both peak
-    to peak: what H does inside the noise would otherwise be taken for slow dynamics.
+    40 operators cover the swing of the record.  A dozen more thresholds cover the excursion of
+    the noise.  Swing and excursion are peak to peak.  Without thresholds inside the excursion,
+    the fit of G would take hysteresis inside the noise for slow dynamics.
     """
     fine = excursion * np.arange(1, 13) / 12.0
     return np.unique(np.concatenate([even_thresholds(swing, 40), fine[fine < 0.9 * swing]]))
@@ -84,7 +86,7 @@ def fine_thresholds(swing: float, excursion: float) -> Array:
 
 @kernel
 def _average(x: Array, stretches: Integers, row: int, out: Array) -> None:
-    # a mean never reaches across a hole in the mask; the last incomplete row is left out
+    # a mean never crosses a hole in the mask; the last incomplete row is left out
     place = 0
     for m in range(stretches.shape[0]):
         for i in range((stretches[m, 1] - stretches[m, 0]) // row):
@@ -102,16 +104,16 @@ def factorise(
     Parameters
     ----------
     excerpts : sequence of Excerpt
-        Each gets an offset of its own.
+        Each excerpt gets an offset of its own.
     law : HysteresisLaw, or ndarray of shape (m,)
-        The thresholds alone stand for the law of plays.
+        Thresholds alone stand for the law of plays.
     dynamics, delay
-        What the plays pass before they are seen.
+        G and the delay that the plays pass.
 
     Returns
     -------
     ndarray, shape (k + size + 1, k + size + 1)
-        k is the number of excerpts, size that of the law.
+        k is the number of excerpts, size the number of columns of the law.
     """
     law = _law(law)
     rows = filtered_rows(excerpts, law, dynamics, delay)
@@ -121,9 +123,9 @@ def factorise(
 def filtered_rows(
     excerpts: Sequence[Excerpt], law: HysteresisLaw, dynamics: Dynamics, delay: Delay
 ) -> Iterator[Array]:
-    """Give the rows that `factorise` reduces, in their order in time, excerpt by excerpt."""
+    """Yield the rows that `factorise` reduces, in order of time, one block per excerpt."""
     k, r = len(excerpts), law.thresholds
-    # a part of a sample of delay is a mean of two samples, which may as well come behind the plays
+    # a fraction of a sample of delay is a mean of two samples; G can apply it behind the plays
     part = np.array([1.0 - delay.fraction, delay.fraction])
     G = replace(dynamics, b=np.convolve(dynamics.b, part)) if delay.fraction else dynamics
     for i, excerpt in enumerate(excerpts):
@@ -132,14 +134,14 @@ def filtered_rows(
         n = excerpt.rows
         block = np.zeros((k + law.size + 1, n))
         block[i] = np.sqrt(row)
-        # the plays need all that came before the samples used, G only what it remembers
+        # the plays need all earlier samples, G only as many as it remembers
         begin, end = (stretches[0, 0], stretches[-1, 1]) if n else (0, 1)
         begin = max(0, begin - dynamics.memory(FORGOTTEN) - delay.samples - 1)
-        # lags along the path start with the excerpt
+        # lags along the path start with the excerpt, so they need it from its first sample
         begin = 0 if law.lags else begin
         stretches -= begin
         before, u = excerpt.u[:begin], excerpt.u[begin:end]
-        # the memory alone; a frozen array would be another type to the compiler
+        # advance the memory alone; a frozen array would be another type to the compiler
         hysteresis(before, np.array(r), np.zeros(r.size), 0.0, 0.0, memory, np.empty(begin))
         u = Delay(delay.samples).apply(u)
         for j, column in enumerate(law.columns(u, memory), start=k):
@@ -154,11 +156,12 @@ def _law(law: HysteresisLaw | Array) -> HysteresisLaw:
 
 def _independent(A: Array, m: int, densities: int) -> Mask:
     """
-    Return which columns of m plays, further densities and the powers of v the data tell apart.
+    Mark the columns that the data can tell apart.
 
-    A voltage that only takes two levels makes every play and the cubic a multiple of v: then the
-    linear term is kept, and weights of any size cannot cancel each other.  Further densities are
-    sums of plays by themselves; being >= 0, they cannot cancel them, only the powers.
+    The columns are m plays, further densities, and powers of v.  A voltage with only two levels
+    makes every play and the cubic a multiple of v.  The linear term is then kept, so that large
+    weights cannot cancel each other.  Further densities are sums of plays.  Their weights are
+    >= 0, so they cannot cancel plays, only powers of v.
     """
     size = A.shape[1]
     keep, basis = np.zeros(size, dtype=bool), np.empty((A.shape[0], 0))
@@ -189,9 +192,9 @@ class HysteresisFit:
         Displacement at u = 0 of each excerpt, normalised.
     solver : {'least_squares', 'swarm'}
     polished : bool
-        Whether bounded least squares finished what the swarm found.
+        Whether bounded least squares finished the fit of the swarm.
     loss : float
-        Sum of squares of the returned weights, over `n` samples.
+        Sum of squares with the returned weights, over `n` samples.
     swarm_loss : float or None
         Sum of squares that the swarm reached.
     optimum_loss : float
@@ -199,16 +202,16 @@ class HysteresisFit:
     n : int
         Samples fitted.
     std : ndarray, shape (m + 2,)
-        Standard deviation of the weights, p1 and p2 for white residuals; zero on a bound, and
-        where the data do not excite the play.
+        Standard deviation of the weights, p1 and p2 for white residuals.  It is zero for a weight
+        on a bound, and for a play that the data do not excite.
     swarm : scipy.optimize.OptimizeResult or None
     coefficients : ndarray, shape (size,)
-        Of the law.
+        Coefficients of the columns of the law.
     law : str
         Name of the law (`piezo_ident.operators.hysteresis_law.LAWS`).
     errors_of_laws : mapping of str to float
-        Of each law that was tried, the error of parts of the data predicted from all others
-        (`piezo_ident.identification.step3_choice.Choice`); empty where none could be better.
+        Error of each law that was tried.  Parts of the data are predicted from all others
+        (`piezo_ident.identification.step3_choice.Choice`).  Empty if no law could be better.
     """
 
     hysteresis: Hysteresis
@@ -231,7 +234,7 @@ class HysteresisFit:
         return float(np.sqrt(self.loss / self.n))
 
     def left(self, R: Array) -> float:
-        """Return the sum of squares that it leaves of the same runs as `factorise` has them."""
+        """Compute the sum of squares of the residual; R is of the same runs as in `factorise`."""
         theta = np.concatenate([self.offsets, self.coefficients])
         return float(np.sum((R[:, :-1] @ theta - R[:, -1]) ** 2))
 
@@ -254,35 +257,35 @@ def fit_hysteresis(
     R : ndarray
         From `factorise`.
     law : HysteresisLaw, or ndarray of shape (m,)
-        As there.
+        As for `factorise`.
     n : int, optional
-        Number of samples behind R; only `rms` and `std` of the result go by it.
+        Number of samples behind R; only `rms` and `std` of the result depend on it.
     solver : {'least_squares', 'swarm'}
-        Whose weights are returned; both losses are kept.
+        Solver whose weights are returned; the losses of both are kept.
     polish : bool, optional
-        Let bounded least squares finish what the swarm found.
+        Whether bounded least squares finishes the fit of the swarm.
     rows : int, optional
-        Number of rows that the samples were averaged to (`Excerpt.rows`); `n` when absent.
+        Number of rows to which the samples were averaged (`Excerpt.rows`); `n` by default.
     **flight
         `rng` and options of `piezo_ident.identification.solvers.particle_swarm.particle_swarm`.
 
     Raises
     ------
     IdentificationError
-        When the data hold nothing.
+        If the displacement does not move in the data.
     """
     law = _law(law)
     m = law.densities
     k = R.shape[0] - law.size - 1
     inner = R[k:, k:].copy()
-    # a play that stands still in the samples fitted leaves rounding behind, and any weight fits it
+    # a play that stands still leaves only rounding in its column, which any weight would fit
     still = np.linalg.norm(inner[:, :m], axis=0) <= STILL * np.linalg.norm(R[:, -3])
     inner[:, :m][:, still] = 0.0
     inner[:, :-1][:, ~_independent(inner[:, :-1], law.thresholds.size, m)] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
         raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
     lower = law.lower
-    # lags of neighbouring rates can be large and cancel each other where they are fitted alone
+    # lags of neighbouring rates, fitted without a prior, become large and cancel each other
     pull = np.zeros((law.lags, inner.shape[1]))
     pull[:, m : m + law.lags] = PULL * np.linalg.norm(inner[:, -2]) * np.eye(law.lags)
     pulled = np.asarray(np.linalg.qr(np.vstack([inner, pull]), mode='r')) if law.lags else inner
@@ -296,7 +299,7 @@ def fit_hysteresis(
         A, y = inner[:, :-1], inner[:, -1]
         problem = Quadratic(A.T @ A, A.T @ y, float(y @ y))
         swarm = particle_swarm(problem, low, high, tol=1e-3, **flight)
-        # from the factor, not from the Gram matrix: the difference of large squares loses digits
+        # computed by the factor: the Gram matrix takes differences of large squares, losing digits
         swarm_loss = float(np.sum((A @ swarm.x - y) ** 2))
         if not polish:
             x = np.where(A.any(axis=0), swarm.x, 0.0)
@@ -326,7 +329,7 @@ def fit_hysteresis(
 def fit_again(
     fit: HysteresisFit, excerpts: Sequence[Excerpt], dynamics: Dynamics, delay: Delay
 ) -> HysteresisFit:
-    """Return the same law on the same thresholds, its weights fitted to other data."""
+    """Fit the weights of the same law on the same thresholds to other data."""
     h = fit.hysteresis
     law = HysteresisLaw(fit.law, h.thresholds, h.span)
     R = factorise(excerpts, law, dynamics, delay)

@@ -4,11 +4,11 @@
 """
 The three steps on labelled records: delay from steps, G from noise, H from a triangle.
 
-Small noise does not make H a constant slope: its plays are dragged along inside the noise, and a
-linear fit takes that for slow dynamics.  So the steps are taken twice.  After a first G, an H with
-fine thresholds is fitted to the triangle and undone in the noise, w = H[v], and G is found again
-from w to y, where it is alone.  The H that is returned is fitted last, with the thresholds asked
-for.
+Under small noise H is not a constant slope: the noise drags its plays along, and a linear fit
+takes this for slow dynamics.  G is therefore found twice.  After a first G, a temporary H with
+fine thresholds is fitted to the triangle.  Its output w = H[v] replaces the voltage of the noise
+segment, and G is found again from w to y, free of hysteresis.  The returned H is fitted last, with
+the chosen or given thresholds.
 """
 
 from __future__ import annotations
@@ -61,38 +61,39 @@ from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy import signal
 
-#: orders within this share of the best held-out error count as equal; smaller ones go first
+#: orders within this share of the best held-out error count as equal; the smallest is tried first
 SLACK = 0.05
 #: share by which instrumental variables must err less than least squares to choose the orders
 BENT = 0.2
 #: share by which a larger order must lower the held-out error
 GAIN = 0.005
-#: samples of simulation ahead of the first that counts
+#: samples that are simulated ahead of the first sample that counts
 WARM_UP = 2000
-#: candidates that are refined and judged again
+#: number of candidate orders that are refined and judged again
 CANDIDATES = 5
-#: most iterations that refine a candidate: beside a coarse converter at a high rate, least squares
+#: most iterations that refine a candidate: with a coarse converter at a high rate, least squares
 #: and instrumental variables start far from modes that ring for long
 REFINING = 40
-#: what is slower than this is creep, not dynamics: it is filtered out before G is refined [Hz]
+#: motion slower than this is creep, not dynamics; it is filtered out before G is refined [Hz]
 SLOWEST = 5.0
-#: share by which G refined beside another law of H must err less
+#: share by which the error must fall if G is refined with another law of H
 WORTH = 0.25
 
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
     """
-    Find the delay from the steps, or else from the scan of the ARX loss over the noise.
+    Find the delay from the steps, or without steps from a scan of the ARX loss over the noise.
 
-    Where both differ, or one is missing, a free run over the noise decides.  Where neither tells
-    the delay, it raises IdentificationError.
+    A free run over the noise decides if steps and scan differ, or if both fail.  Raises
+    IdentificationError if no method tells the delay.
     """
     progress('delay', 0.0)
     if settings.delay is not None:
         return DelayResult(settings.delay, float('inf'), 'given')
     pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
     step = delay_from_steps(pieces) if pieces else None
-    # steps have power at all frequencies; noise up to f leaves a doubt of half a period of f
+    # steps have power at all frequencies; noise up to f leaves an uncertainty of half a period of
+    # f
     loss = _scan(runs, 'step') if pieces else None
     if loss is None:
         loss = _scan(runs, 'noise')
@@ -124,7 +125,7 @@ def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
 
 
 def _scan(runs: Sequence[Run], kind: str) -> Array | None:
-    """Return the one-step loss over the delay, from all segments of a kind."""
+    """Compute the one-step loss for each delay, from all segments of a kind."""
     lags, parts = SCAN_ORDER + MAX_DELAY, []
     for run in runs:
         for s in run.piece.find(kind):
@@ -135,19 +136,19 @@ def _scan(runs: Sequence[Run], kind: str) -> Array | None:
 
 
 def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
-    """Return the triangles for fitting H, without (or only) their held-out blocks."""
+    """Cut out the triangles for fitting H, without (or only) their held-out blocks."""
     excerpts = []
     for run in runs:
         out = run.held_out()
         triangle = run.mask('triangle') & run.known
-        # the same runs either way, so that each keeps its offset
+        # the same runs either way, so that each run keeps its offset
         if np.any(triangle & ~out):
             excerpts.append(run.excerpt(triangle & (out if held else ~out)))
     return excerpts
 
 
 def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
-    """Return steps and noise for judging H by small motion."""
+    """Cut out steps and noise, which judge H by small motion."""
     uses = [run.mask('step', 'settle', 'noise') & run.known & ~run.held_out() for run in runs]
     return [
         Excerpt(run.u, run.x, use, run.memory)
@@ -157,7 +158,7 @@ def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
 
 
 def motion_excerpts(runs: Sequence[Run]) -> list[Means]:
-    """Return all motion for fitting H, without the held-out blocks."""
+    """Cut out all motion for fitting H, without the held-out blocks."""
     return [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
 
 
@@ -182,7 +183,7 @@ def _orders(
 
     orders = [settings.order] if settings.order else table.ranked(SLACK)
     if not settings.order:
-        # noise bends the least squares of a mode that rings for thousands of samples
+        # noise biases least squares strongly for a mode that rings for thousands of samples
         sizes = range(2, min(table.loss.shape) + 1, 2)
         by_instruments = {
             (n, n): free_run_error(
@@ -208,7 +209,7 @@ def _orders(
         iv = instrumental_variables(u, y, ls, delay)
         errors = {'least squares': held_error(ls), 'instrumental variables': held_error(iv)}
         start = iv if errors['instrumental variables'] < errors['least squares'] else ls
-        # ticks repeat the share, so that the work can be stopped within an iteration
+        # ticks repeat the share of the work, only so that the caller can stop within an iteration
         tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
         fit = output_error([refined_on], stabilised(start), maxiter=REFINING, tick=tick)
         errors['output error'] = held_error(fit.dynamics)
@@ -225,10 +226,10 @@ def second_step(
     runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress, lean: bool = False
 ) -> tuple[DynamicsResult, Dynamics]:
     """
-    Find G, with the hysteresis undone; the dynamics returned are stable, with G(1) = 1.
+    Find G without hysteresis; the returned dynamics are stable, with G(1) = 1.
 
-    Where `lean`, G goes without the pairs of `slow_part.without_pairs`.  Where no order gives a
-    stable model, it raises IdentificationError.
+    `lean` takes the pairs of `slow_part.without_pairs` out of G.  Raises IdentificationError if no
+    order gives a stable model.
     """
     d = delay.samples
     run, start, stop = longest_noise(runs)
@@ -237,11 +238,11 @@ def second_step(
         return lambda share: progress('dynamics', start + width * share)
 
     progress('dynamics', 0.0)
-    # only good enough to undo the hysteresis
+    # a first G that is only good enough to undo the hysteresis
     rate = run.piece.sample_rate
     raw = noise_segment(run, run.u, start, stop)
     [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
-    del raw  # of an hour's record it is a gigabyte
+    del raw  # a gigabyte for a record of an hour
     G = fast_part(first, rate, lean)
 
     excerpts = triangle_excerpts(runs)
@@ -262,8 +263,7 @@ def second_step(
     fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
     G = fast_part(fit.dynamics, rate, lean)
     progress('dynamics', 0.95)
-    # the same regression on the measured and on the modelled answer: the plays that the noise
-    # drags along count in both
+    # regress the measured and the modelled displacement alike: the noise drags plays along in both
     noise = slice(max(0, start - WARM_UP), stop)
     g_u, g_w = (
         filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :]
@@ -292,8 +292,8 @@ def _best_in_free_run(
     progress: Progress,
     lean: bool,
 ) -> tuple[DynamicsResult, Dynamics]:
-    """Refine each G by its free run, and return the best on what was held out."""
-    # noise alone hardly sees a slow pole with next to no residue; steps that were not fitted do
+    """Refine each G by its free run, and choose the best on the held-out samples."""
+    # noise alone hardly shows a slow pole with a tiny residue; steps that were not fitted show it
     stretches, held = _stretches(runs, H, delay)
     rate = runs[0].piece.sample_rate
     best, (result, G) = float('inf'), found[0]
@@ -303,7 +303,7 @@ def _best_in_free_run(
         fast = fast_part(start, rate, lean)
         fit = output_error(stretches, fast, maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
-        # a larger model comes later, and must earn its size
+        # a larger model comes later, and must lower the error to win
         if score < best / (1.0 + GAIN):
             best, result = score, candidate
             G = fast_part(fit.dynamics, rate, lean)
@@ -320,9 +320,9 @@ def beside_law(
     lean: bool = False,
 ) -> tuple[DynamicsResult, Dynamics] | None:
     """
-    Return G refined beside an H of another law than that it was found with.
+    Refine G with an H of another law than the law with which G was found.
 
-    None where it does not err clearly less on what was held out.
+    None if the refined G does not lower the held-out error by `WORTH`.
     """
     stretches, held = _stretches(runs, H, delay)
     fit = output_error(stretches, G, maxiter=8)
@@ -335,20 +335,20 @@ def beside_law(
 def _stretches(
     runs: Sequence[Run], H: Hysteresis, delay: Delay
 ) -> tuple[list[Excerpt], list[Excerpt]]:
-    """Return what G is refined on, and the same with only what was held out."""
+    """Cut out the excerpts that refine G, and the same excerpts with the held-out samples only."""
     fitted: list[Excerpt] = []
     held: list[Excerpt] = []
     for run in runs:
         out = run.held_out()
         use = run.mask('step', 'settle', 'noise') & run.use
         if use.any():
-            # what lies before the first sample used only has to let the start die away
+            # samples before the first used sample only have to let the transient die away
             first, last = np.flatnonzero(use)[[0, -1]]
             part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
             w, y = delay.apply(run.through(H))[part], run.x[part]
             w, y = w - w[0], y - y[:20].mean()
             if run.piece.sample_rate > 2.0 * SLOWEST:
-                # both sides pass the same filter, so G is still what leads from one to the other
+                # input and output pass the same filter, so G still leads from one to the other
                 sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
                 w, y = signal.sosfilt(sos, w), signal.sosfilt(sos, y)
             for stretches, mask in ((fitted, use & ~out), (held, use & out)):
@@ -360,12 +360,12 @@ def _stretches(
 def model_of(
     rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
 ) -> StageModel:
-    """Return the model, its zero of displacement moved by the offset of the fit."""
+    """Build the model; the offset of the fit moves its zero of displacement."""
     moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
     return StageModel(rate, moved, fit.hysteresis, G, delay)
 
 
 def within(model: StageModel, low: float, high: float) -> StageModel:
-    """Return the model as identified between two normalised voltages."""
+    """Set the identified range of a model, from two normalised voltages."""
     span = (model.scaling.v(low), model.scaling.v(high))
     return replace(model, scaling=replace(model.scaling, range=span))

@@ -26,20 +26,21 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.suspicions import line_error, misspelt
 
-#: change of G within the excited band below which the band is too narrow to know G by
+#: change of G within the excited band below which the band is too narrow to know G
 HARDLY = 0.1
-#: measured and modelled small-signal gain may differ by this share before it is said
+#: measured and modelled small-signal gain may differ by this share without a warning
 SLOPE_TOLERANCE = 0.05
-#: zeros of displacement may differ by this share of the stroke before it is said
+#: zeros of displacement may differ by this share of the stroke without a warning
 ZERO_MOVED = 2e-3
-#: crossings of the range, two a sweep up and down, from which a record is no single sweep
+#: crossings of the range, two for each sweep up and down, that make more than a single sweep
 CROSSINGS = 4.0
-#: parts of the range in which the two branches of a loop are compared, and how many must be seen
+#: number of parts of the range in which the two branches of a loop are compared, and the number
+#: that must hold data
 BINS, SEEN = 16, 12
-#: distance of the branches at both ends from which it is said, in parts of that in the middle, and
-#: as a share of the stroke
+#: smallest distance of the branches at both ends that is reported, relative to the distance in the
+#: middle, and as a share of the stroke
 OPEN, OPENING = 2.0, 0.1
-#: what each wider law of H has
+#: terms of each wider law of H, in words
 LAW_WORDS = {
     'square': 'a square of the voltage',
     'bias': 'plays whose weight goes with the voltage',
@@ -52,9 +53,9 @@ def warnings_of(
     result: Identification, records: Sequence[Record], pieces: Sequence[Piece]
 ) -> list[str]:
     """
-    Return where the steps contradict each other, or the data do not carry what was fitted.
+    List contradictions between the steps, and fits that the data do not support.
 
-    `records` were fitted; `pieces` are those of them that have the sampling rate of the model.
+    `records` were fitted; `pieces` are their pieces at the sampling rate of the model.
     """
     warnings = [*_of_fit(result), *_of_band(result.dynamics, result.model)]
     wrong = misspelt([label for record in records for label in record.labels])
@@ -64,12 +65,12 @@ def warnings_of(
 
 
 def _of_axes(pieces: Sequence[Piece]) -> list[str]:
-    """Say when other axes were driven, too."""
+    """Warn if other axes were driven, too."""
     moved = {
         name: None
         for piece in pieces
         for name, x in piece.channels.items()
-        # the monitor of an axis at rest has noise
+        # the voltage monitor of an axis at rest still shows noise
         if role_of(name) == 'v' and np.ptp(x) > MOVES * np.ptp(piece.v)
     }
     if not moved:
@@ -81,7 +82,7 @@ def _of_axes(pieces: Sequence[Piece]) -> list[str]:
 
 
 def _of_law(fit: HysteresisFit) -> list[str]:
-    """Say when the loops are no sum of plays."""
+    """Report a wider law of H than the sum of plays."""
     if fit.law == 'plays':
         return []
     ours, plays = (100.0 * fit.errors_of_laws[name] for name in (fit.law, 'plays'))
@@ -92,7 +93,7 @@ def _of_law(fit: HysteresisFit) -> list[str]:
 
 
 def warn_of_delay(delay: DelayResult) -> list[str]:
-    """Return a warning where noise alone tells the delay, and why the steps do not."""
+    """Warn if noise alone tells the delay, with the reason why the steps do not."""
     if delay.step is not None and delay.step.samples is not None:
         return []
     if delay.source == 'scan':
@@ -140,9 +141,9 @@ def _of_fit(result: Identification) -> list[str]:
 
 
 def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
-    """Say when the excitation ends where G has hardly begun to act."""
-    # a band that ends near half the sampling rate leaves nothing to see, and without a G that is
-    # said already
+    """Warn if the excitation ends before G acts."""
+    # no warning if the band ends near half the sampling rate, where no frequencies remain, or if G
+    # is static, which has its own message
     if not dynamics.known_to < 0.2 * model.sample_rate or model.dynamics.is_static:
         return []
     G = model.dynamics.response([dynamics.known_to], model.sample_rate)[0]
@@ -151,8 +152,8 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
         return []
     return [
         f'the voltage drives the stage up to {dynamics.known_to:.3g} Hz, where G is within '
-        f'{100 * change:.2g} % of its static gain: what it does beyond is not known; record noise '
-        'up to higher frequencies'
+        f'{100 * change:.2g} % of its static gain, so G is unknown at higher frequencies; record '
+        'noise up to there'
     ]
 
 
@@ -162,7 +163,7 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     error = held if np.isfinite(held) else chosen
     line, y = line_error(pieces), np.concatenate([piece.y for piece in pieces])
     resting = 100.0 * float(y.std() / max(np.ptp(y), np.finfo(float).tiny))
-    # a stage without hysteresis is a line with noise
+    # a stage without hysteresis is a line with noise, and its model cannot beat the line
     if np.isfinite(error) and error > max(0.5 * line, 2.0 * (result.noise_floor or 0.0)):
         warnings.append(
             f'the model errs by {error:.3g} % of stroke, where a straight line errs by '
@@ -172,12 +173,12 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
     easy = [row.percent for row in result.errors if row.data == 'held out' and not row.driven]
     if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
         warnings.append(
-            f'where the stage only rests or is moved over, the model errs by up to '
-            f'{max(easy):.3g} % of stroke, more than the {chosen:.3g} % on what chose it: the '
-            'stage does something that the model lacks; judge it on a record of another kind'
+            f'on rests and ramps the model errs by up to {max(easy):.3g} % of stroke, more than '
+            f'the {chosen:.3g} % on the data that chose it. The model lacks an effect of the '
+            'stage; judge it on a record of another kind'
         )
     fitted = result.error('fitted')
-    # a record without noise may be fitted exactly
+    # a record without noise may be fitted exactly, so a tiny error serves as the smallest
     if result.dynamics.table is None and held > 3.0 * max(fitted, 1e-9):
         span = max(float(np.ptp(piece.v)) for piece in pieces)
         times = sum(float(np.abs(np.diff(piece.v)).sum()) for piece in pieces) / span
@@ -191,9 +192,9 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
 
 
 def only_jumps(excerpts: Sequence[Excerpt]) -> str:
-    """Say that the voltage leaves too much out between its levels, where it does."""
+    """Describe the gap between levels of the voltage if it only jumps; else empty."""
     gap = min(map(_jumped_over, (e.u for e in excerpts)))
-    # on as many levels as the paper has plays, a staircase is a triangle
+    # on as many levels as the paper has plays, a staircase is as good as a triangle
     if PAPER_COUNT * gap <= 1.0:
         return ''
     return (
@@ -204,9 +205,9 @@ def only_jumps(excerpts: Sequence[Excerpt]) -> str:
 
 def _jumped_over(u: Array) -> float:
     """
-    Return the widest gap between levels at which a voltage rests, as a share of its range.
+    Compute the widest gap between levels at which a voltage rests, as a share of its range.
 
-    It is 0 unless the voltage rests, but for a few samples that make nearly all of its way.
+    The gap is 0 unless the voltage rests most of the time and moves in a few large jumps.
     """
     du, span = np.abs(np.diff(u)), float(np.ptp(u))
     large = du > 0.02 * span
@@ -217,10 +218,11 @@ def _jumped_over(u: Array) -> float:
 
 def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[str]:
     """
-    Return a warning where the displacement does with the voltage what no H of this package can.
+    Warn if the displacement depends on the voltage as no H of this package can.
 
-    The branches of H rise, and so less than half of the variance of a loop is even, the same for
-    a rise of the voltage from the middle as for a fall.  Loops of plays are widest in the middle.
+    The branches of H rise.  Less than half of the variance of its loop is therefore even, that is,
+    the same for a rise of the voltage from the middle as for a fall.  Loops of plays are widest in
+    the middle.
     """
     measured = _branches(predictions, [p.run.piece.y / scaling.Y for p in predictions])
     modelled = _branches(predictions, [p.y_hat / scaling.Y for p in predictions])
@@ -234,8 +236,8 @@ def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[s
     if even > odd:
         warnings.append(
             f'{even / (even + odd):.0%} of the displacement is even in the voltage about '
-            f'{middle:.4g} V, the same for a rise as for a fall (variance of its mean loop): the '
-            'branches of H rise, and hold less than half of that'
+            f'{middle:.4g} V, the same for a rise as for a fall (variance of its mean loop). '
+            'The branches of H rise, so less than half of its loop is even'
         )
     apart, of_model = (
         [float(np.nanmean((x[1] - x[0])[third])) for third in thirds] for x in (measured, modelled)
@@ -255,7 +257,7 @@ def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[s
 
 
 def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Array:
-    """Return the means of signals in parts of the range, shape (2, BINS), rising and falling."""
+    """Average signals in parts of the range, shape (2, BINS), on rising and falling branch."""
     u, x = np.concatenate([p.run.u for p in predictions]), np.concatenate(signals)
     du = np.concatenate([np.gradient(p.run.u) for p in predictions])
     use = np.concatenate([p.run.use for p in predictions])
@@ -269,7 +271,7 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
 
 
 def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:
-    """Return a warning when the held-out parts leave the voltages of the fitted ones."""
+    """Warn if the held-out parts leave the voltage range of the fitted parts."""
     pairs = list(zip(runs, fitted, strict=True))
     parts = [run.u[mask] for run, mask in pairs], [run.u[~mask] for run, mask in pairs]
     spans = [(min(map(np.min, part)), max(map(np.max, part))) for part in parts]
@@ -283,7 +285,7 @@ def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling)
 
 
 def warn_of_zeros(offsets: Mapping[tuple[str, float], float], scaling: Scaling) -> list[str]:
-    """Return a warning where the displacement of a run has another zero than the model."""
+    """Warn if the displacement of a run has another zero than the model."""
     return [
         f'{record}: its zero of displacement lies {1e6 * offset:.3g} um from that of the model; '
         'its errors are told without it'

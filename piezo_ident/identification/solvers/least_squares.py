@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Least squares on a triangular factor: samples are read once, every fit after that is small."""
+"""Solve least squares on a triangular factor: samples are read once, and all fits are small."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear
 
-#: rows that are factorised at once: a block of some dozen columns stays in the cache
+#: number of rows that are factorised at once: a block of some dozen columns fits into the cache
 ROWS = 1024
 
 
 @contextmanager
 def singular_is_ours() -> Iterator[None]:
-    """Turn numpy's error for a singular fit into one that says what the data lack."""
+    """Replace the error of numpy for a singular fit by an error that says what the data lack."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -31,7 +31,7 @@ def singular_is_ours() -> Iterator[None]:
 
 def triangular_factor(blocks: Iterable[Array], width: int) -> Array:
     """
-    Return R of the QR factorisation of all rows, in constant memory; shape (width, width).
+    Compute R of the QR factorisation of all rows, in constant memory; shape (width, width).
 
     The blocks have shape (rows, width); ``R'R`` is the Gram matrix of the columns.
     """
@@ -57,7 +57,7 @@ def bounded_least_squares(R: Array, lower: Array, upper: Array) -> tuple[Array, 
     -------
     x : ndarray, shape (n,)
     loss : float
-        The sum of squares at x.
+        Sum of squares at x.
 
     Examples
     --------

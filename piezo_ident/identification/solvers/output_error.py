@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Refinement of G by output error: the parameters that simulate best, not those that predict a step.
+Refine G by output error: the parameters minimise the error of the free run, not of one step.
 
-Gauss-Newton with Levenberg's damping on  sum (y - B/A z^-d w - offset)^2.  With w_f = w/A and
-y_f = y_sim/A the gradients are shifts of two filtered signals:
+Gauss-Newton with the damping of Levenberg minimises  sum (y - B/A z^-d w - offset)^2.  With
+w_f = w/A and y_f = y_sim/A the gradients are shifts of two filtered signals:
 
     d y_sim / d b_j = w_f(k-d-j+1),      d y_sim / d a_i = - y_f(k-i)
 
@@ -25,15 +25,15 @@ from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
-#: samples whose products are summed at once
+#: number of samples whose products are summed at once
 STRETCH = 1024
-#: the refinement ends when the loss falls by less than this share
+#: the refinement ends if the loss falls by less than this share
 SLOW = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class OutputErrorFit:
-    """Result of the refinement; the covariance is that of (a, b), for white output noise."""
+    """Result of the refinement; the covariance of (a, b) assumes white output noise."""
 
     dynamics: Dynamics
     covariance: Array
@@ -54,12 +54,12 @@ class OutputErrorFit:
 @kernel
 def _first_row(x: Array, z: Array, x_at: int, z_at: int, n: int, lags: int) -> Array:
     row = np.zeros(lags)
-    # all lags of a stretch while it is in the cache
+    # all lags of a stretch are summed while it is in the cache
     for start in range(0, n, STRETCH):
         size = min(STRETCH, n - start)
         a = x[x_at + start : x_at + start + size]
         for j in range(lags):
-            # slices, whose indices cannot be negative, let the loop run in vector lanes
+            # slices have no negative indices, which lets the compiler vectorise the loop
             b = z[z_at + start - j : z_at + start - j + size]
             total = 0.0
             for k in range(size):
@@ -70,10 +70,10 @@ def _first_row(x: Array, z: Array, x_at: int, z_at: int, n: int, lags: int) -> A
 
 def lag_products(x: Array, z: Array, x_at: int, z_at: int, n: int, n_x: int, n_z: int) -> Array:
     """
-    Return the sums of products of lagged signals, without the matrix of their lags.
+    Sum the products of lagged signals, without the matrix of their lags.
 
-    ``S(i, j)`` is the sum over n samples of ``x(k - i) z(k - j)``.  Row 0 and column 0 are summed;
-    each further row follows from the one before:
+    ``S(i, j)`` is the sum over n samples of ``x(k - i) z(k - j)``.  Row 0 and column 0 are summed
+    directly.  Each further row follows from the row above:
 
         S(i+1, j+1) = S(i, j) + x(s-1-i) z(s-1-j) - x(e-1-i) z(e-1-j)
 
@@ -81,11 +81,11 @@ def lag_products(x: Array, z: Array, x_at: int, z_at: int, n: int, n_x: int, n_z
     ----------
     x, z : ndarray, shape (any,)
     x_at, z_at : int
-        Where the n samples s .. e-1 begin in each; at least as many samples as there are lags
-        come before.
+        Index of the first of the n samples s .. e-1 in each signal.  At least as many samples as
+        lags come before it.
     n : int
     n_x, n_z : int
-        Lags of each, at least 1.
+        Number of lags of each, at least 1.
 
     Returns
     -------
@@ -126,8 +126,8 @@ def _mean(x: Array, stretches: Stretches) -> float:
 
 
 def _past(x: Array, stretches: Stretches, count: int, negative: bool = False) -> Array:
-    # before the record the stage was at rest; a constant has no part in what is eliminated with
-    # the offsets, and without it the sums lose no digits
+    # the stage was at rest before the record.  The level does not change the result, because the
+    # offsets are eliminated; without the level the sums lose no digits
     level = _mean(x, stretches)
     past = np.empty(count + x.size)
     if negative:
@@ -147,7 +147,7 @@ class _Problem:
         self.used = [s.stretches for s in stretches]
 
     def errors(self, model: Dynamics) -> list[Array]:
-        """Return what the free run leaves of each stretch, without its mean."""
+        """Compute the free-run error of each stretch, without its mean."""
         found = []
         for s, used in zip(self.stretches, self.used, strict=True):
             e = filter_arx(model.a, model.b, s.u)
@@ -167,10 +167,10 @@ class _Problem:
         H, g = np.zeros((p, p)), np.zeros(p)
         one = np.ones(1)
         for s, e, used in zip(self.stretches, errors, self.used, strict=True):
-            # what is y(k-1), y(k-2), ... and w(k), w(k-1), ... to the products
+            # lagged signals of the products: y(k-1), y(k-2), ... and w(k), w(k-1), ...
             groups = []
             if na:
-                # the simulated output but for a constant, which `_past` takes out
+                # x - e is the simulated output plus a constant, which `_past` removes
                 y_f = _past(filter_arx(model.a, one, s.x - e), used, p, negative=True)
                 groups.append((y_f, p - 1, slice(0, na), na))
             w_f = _past(filter_arx(model.a, one, s.u), used, p)
@@ -196,7 +196,7 @@ class _Problem:
 
 
 def simulation_error(stretches: Sequence[Excerpt], model: Dynamics) -> float:
-    """Return the rms of the free-run error, an offset taken out of each stretch."""
+    """Compute the rms of the free-run error, around the mean of each stretch."""
     problem = _Problem(stretches, model.a.size, model.b.size)
     return float(np.sqrt(problem.loss(problem.errors(model))))
 
@@ -217,12 +217,12 @@ def output_error(
         Stable start; its orders are kept.
     maxiter : int, optional
     tick : callable, optional
-        Called once an iteration; may raise to stop the work.
+        Called once an iteration; it may raise to stop the work.
 
     Returns
     -------
     OutputErrorFit
-        Always stable; the start itself when nothing better was found.
+        Stable dynamics; the start itself if no step lowers the error.
     """
     na, nb = start.a.size, start.b.size
     problem = _Problem(stretches, na, nb)

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Particle swarm for a bounded least-squares problem, reduced to its Gram matrix.
+Minimise a bounded least-squares problem, reduced to its Gram matrix, by a particle swarm.
 
     V <- chi V + c rand() (own best - X) + c rand() (best of the neighbours - X),     X <- X + V
 
 Kennedy and Eberhart (1995), doi:10.1109/ICNN.1995.488968, with the constriction of Clerc and
-Kennedy (2002), doi:10.1109/4235.985692.  The particles sit on a ring and each follows the best of
-its six nearest neighbours: following the best of all, the swarm collapsed onto a wall of the box
-before it reached the optimum of an ill-conditioned least-squares problem (3 of 20 seeds came
-within 1 % of it; on the ring 20 of 20 did).
+Kennedy (2002), doi:10.1109/4235.985692.  The particles sit on a ring, and each follows the best of
+its six nearest neighbours.  If all followed the best of the swarm, the swarm collapsed onto a wall
+of the box before it reached the optimum of an ill-conditioned least-squares problem (3 of 20 seeds
+came within 1 % of it; on the ring 20 of 20 did).
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from scipy.optimize import OptimizeResult
 #: constriction factor and attraction of Clerc and Kennedy
 CHI = 0.7298
 ATTRACTION = 1.49618
-#: neighbours on either side of the ring
+#: number of neighbours on either side of the ring
 REACH = 3
-#: share of the speed with which a particle comes back from a wall of the box
+#: share of its speed that a particle keeps when a wall of the box reflects it
 BOUNCE = 0.5
-#: iterations between two looks at the stopping rules, and at most at the callback
+#: number of iterations between two checks of the stopping rules, and most between two callbacks
 STRETCH = 100
-#: work between two looks at the callback, in products of two numbers: some ten milliseconds
+#: work between two callbacks, in products of two numbers: some ten milliseconds
 WORK = 1e7
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
     """
-    The objective ``x' P x - 2 g' x + c``; P and g have shapes (n, n) and (n,).
+    Objective ``x' P x - 2 g' x + c``; P and g have shapes (n, n) and (n,).
 
     With P = A'A, g = A'y and c = y'y it is ``|A x - y|^2`` without the samples.
     """
@@ -55,7 +55,7 @@ class Quadratic:
         object.__setattr__(self, 'g', frozen_array(self.g))
 
     def __call__(self, x: Array) -> Array:
-        """Return the objective at points x, shape (..., n)."""
+        """Evaluate the objective at points x, shape (..., n)."""
         quadratic = np.einsum('...i,ij,...j->...', x, self.P, x)
         return np.asarray(quadratic - 2.0 * x @ self.g + self.c)
 
@@ -123,27 +123,27 @@ def particle_swarm(
     lower, upper : ndarray, shape (n,)
         Finite bounds; the swarm starts uniformly inside them.
     rng : numpy.random.Generator
-        The only source of chance: same state, same result.
+        Only source of chance: the same state gives the same result.
     swarm_size : int, optional
     maxiter : int, optional
     tol : float, optional
-        Stop when the best value fell by less than this share of itself over 1,000 iterations;
+        Stop if the best value fell by less than this share of itself over 1,000 iterations;
         0 (default) runs all iterations.
     callback : callable, optional
-        Called as ``callback(intermediate_result)`` every 100 iterations, more often where many
-        particles or parameters make them slow; a true answer ends the search with what has been
-        found.
+        Called as ``callback(intermediate_result)`` every 100 iterations, or more often if many
+        particles or parameters make iterations slow.  A true answer ends the search with the best
+        point so far.
 
     Returns
     -------
     scipy.optimize.OptimizeResult
-        With ``x``, ``fun``, ``nit``, ``nfev``, ``success``, ``status``, ``message`` and
+        It has ``x``, ``fun``, ``nit``, ``nfev``, ``success``, ``status``, ``message`` and
         ``swarm_size``.
 
     Raises
     ------
     ConfigError
-        When bounds are not finite or crossed, or a size is not positive.
+        If bounds are not finite or crossed, or a size is not positive.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def particle_swarm(
         raise ConfigError('swarm: every parameter needs two finite bounds, the lower one first')
     if swarm_size < 2 or maxiter < 1:
         raise ConfigError('swarm: needs at least 2 particles and 1 iteration')
-    # of one layout for the compiler, whatever they are columns or rows of
+    # copies have one memory layout for the compiler, even if the bounds are columns of an array
     lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
     n = lower.size
     X = lower + (upper - lower) * rng.random((swarm_size, n))
