@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Operators in C: the text that `piezo_ident.export` makes a header of.
+Operators as C code, from which `piezo_ident.export` makes a header.
 
-An operator says in C what it does to one sample, beside the loop that does it in Python; its
-numbers are those of the loop.  The loops of `piezo_ident.operators.kernels` are here, in their
-order of operations but for that of sums: what that changes is of the last digit, since a G that
-would amplify it runs as sections.
+The C statements of an operator process one sample with the numbers of the Python loop.  The loops
+of `piezo_ident.operators.kernels` keep their order of operations here, except in sums.  The order
+of a sum only changes the last digit: a G that would amplify the change runs as sections.
 """
 
 from __future__ import annotations
@@ -20,33 +19,33 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import path_lines
 
-#: constants of an operator by name
+#: constants of an operator, by name
 Numbers = dict[str, float | int | Array]
 
 
 @dataclass(frozen=True, eq=False)
 class CCode:
     """
-    An operator in C.
+    C code of an operator.
 
-    The statements find the signal as `x`, and leave there what goes out.  They may use the
-    numbers by their names, the state as ``s->name``, the normalised command `v`, the time `t` [s],
-    the signal into H as `u` (in the slot ``hysteresis``, where `x` is what H has made of it), the
-    further channel as `c`, and the functions ``piezo_alive``, ``piezo_held`` and ``piezo_curve``,
-    which are `piezo_ident.common.kernel.alive` and `held` and `curve` of the kernels.
+    The statements read the signal from `x` and write the result to `x`.  They may use the numbers
+    and the further channel `c` by name, the state as ``s->name``, the normalised command `v` and
+    the time `t` [s].  `u` is the signal into H; in the slot ``hysteresis``, `x` is the output of
+    H.  The functions ``piezo_alive``, ``piezo_held`` and ``piezo_curve`` stand for
+    `piezo_ident.common.kernel.alive`, and for `held` and `curve` of the kernels.
 
     Attributes
     ----------
     numbers : mapping of str to float, int or ndarray, shape (n,)
         Constants.
     state : str
-        Members of a struct.
+        Members of the struct that holds the state.
     rest : str
-        Statements that bring it to rest; without any, the signal passes at rest as it is.
+        Statements that bring the state to rest; without them the signal passes unchanged.
     step : str
-        Statements for one sample; none where the operator does nothing.
+        Statements for one sample; empty if the operator does nothing.
     channel : str
-        Further channel that it needs, or nothing.
+        Name of the further channel that the operator needs, or empty.
     """
 
     numbers: Numbers = field(default_factory=dict)
@@ -76,7 +75,7 @@ _PLAYS_AT_REST = """
         s->f[i] = piezo_held(0.0, x - r[i], x);
 }
 """
-# `lags` is their sum behind a step of the voltage to `to`
+# `lags` becomes the sum of the lags after the voltage went to `to`
 _LAGS = """
 {
     const double length = fabs(to - s->last);
@@ -115,7 +114,7 @@ _LAGS_AT_REST = """
 
 
 def hysteresis_in_c(h: Hysteresis) -> CCode:
-    """Return H, as `hysteresis`, `wide_hysteresis` and `relaxing` have it."""
+    """Write H in C, as `hysteresis`, `wide_hysteresis` and `relaxing` compute it."""
     m = h.thresholds.size
     r, q, p1, p2, p0, low, c = h.for_kernel
     numbers: Numbers = {'p0': p0, 'p1': p1, 'p2': p2}
@@ -130,18 +129,18 @@ def hysteresis_in_c(h: Hysteresis) -> CCode:
         step += _WIDE
     if h.relaxations is not None and len(h.relaxations):
         n = len(h.relaxations)
-        # names of their own beside those of the curves
+        # these names differ from the names of the curves
         rows = zip(('rate', 'd1', 'd2', 'd3'), h.relaxations.T, strict=True)
         numbers |= {'n': n, 'lines': path_lines(np.array(h.relaxations)).ravel(), **dict(rows)}
         state += f'double z[{n}];\ndouble last;\n'
         rest += _LAGS_AT_REST.replace('LAGS', _LAGS)
         step += f'{{\nconst double to = x;\ndouble lags;\n{_LAGS}\nw += lags;\n}}\n'
     step += 'x = w + ((p1 * x + p0) * x + p2) * x;\n'
-    # H at rest has met its voltage once
+    # at rest, H has processed its voltage once
     return CCode(numbers, state, f'{rest}{{\n{step}}}\n', step)
 
 
-# each sum as two, of which neither waits for the other
+# two sums run side by side, and neither waits for the other
 _G = """
 const double *past;
 double y = 0.0, other = 0.0;
@@ -213,14 +212,14 @@ _SECTIONS_AT_REST = """
 
 
 def dynamics_in_c(g: Dynamics) -> CCode:
-    """Return G, as `dynamics` or `run_sections` have it."""
+    """Write G in C, as `dynamics` or `run_sections` computes it."""
     if g.sections is not None:
         n = len(g.sections)
         numbers: Numbers = {'n': n, 'sections': g.sections.ravel()}
         return CCode(numbers, f'double z[{n}][2];\n', _SECTIONS_AT_REST, _SECTIONS)
     na, nb = g.a.size, g.b.size
     numbers = {'nb': nb, 'b': g.b[::-1], 'na': na, 'a': g.a[::-1], 'gain': g.gain}
-    # every sample stands twice, so that the past is always in one piece
+    # every sample is stored twice, so that the past is always contiguous
     state = f'double w[{2 * nb}];\nint at_w;\n'
     if not na:
         return CCode(numbers, state, _G_AT_REST, f'{_G}x = y + other;\n')
@@ -229,7 +228,7 @@ def dynamics_in_c(g: Dynamics) -> CCode:
 
 
 def delay_in_c(delay: Delay) -> CCode:
-    """Return z^-d, as `DelayOperator` has it."""
+    """Write z^-d in C, as `DelayOperator` computes it."""
     if delay.total == 0.0:
         return CCode()
     between = delay.fraction > 0.0

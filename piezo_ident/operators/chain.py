@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The block of samples that passes the chain, and the operators of the chain.
+Block of samples that passes the chain, and the interface of its operators.
 
     v --> [input] --> [hysteresis] --> [hidden] --> [G, z^-d] --> [output] --> [acquisition] --> y
 
-Everything inside the chain is in normalised units: u = (v - v0)/V and (y - y0)/Y.
+All signals inside the chain are normalised: u = (v - v0)/V and (y - y0)/Y.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 from piezo_ident.common.arrays import Array
 
-#: the slots of a chain for effects, in the order of the signal
+#: slots of a chain for effects, in the order of the signal
 Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 
 
@@ -31,9 +31,9 @@ class Block:
     t : ndarray, shape (n,)
         Time [s].
     v : ndarray, shape (n,)
-        Command, normalised; operators in any slot may use it.
+        Command, normalised; an operator in any slot may use it.
     x : ndarray, shape (n,)
-        The signal on its way through the chain, normalised.
+        Signal on its way through the chain, normalised.
     channels : mapping of str to ndarray, shape (n,)
         Further measured signals in their own units.
     """
@@ -44,37 +44,37 @@ class Block:
     channels: Mapping[str, Array] = field(default_factory=dict)
 
     def with_signal(self, x: Array) -> Block:
-        """Return the block with another signal."""
+        """Replace the signal of the block."""
         block = object.__new__(Block)
-        # replace() is slow for short blocks
+        # dataclasses.replace() is slow for short blocks
         block.__dict__.update(self.__dict__, x=x)
         return block
 
 
 class Operator(Protocol):
-    """One element of a chain; it keeps its state between blocks."""
+    """Element of a chain; it keeps its state between blocks."""
 
     def reset(self, v0: float, x0: float) -> float:
         """
         Come to rest under a constant command v0 and incoming signal x0, both normalised.
 
-        Return the outgoing signal at rest.
+        The result is the outgoing signal at rest.
         """
         ...
 
     def process(self, block: Block) -> Block:
-        """Return the block after this operator; how a stream is cut must not matter."""
+        """Process the next block; the result must not depend on how a stream is cut."""
         ...
 
 
 class Chain:
-    """Operators in series, as one operator."""
+    """Operators in series, used as one operator."""
 
     def __init__(self, operators: tuple[Operator, ...]) -> None:
         self.operators = operators
 
     def reset(self, v0: float, x0: float) -> float:
-        """Bring every operator to rest, and return the last one's output."""
+        """Bring every operator to rest; the result is the output of the last operator."""
         for operator in self.operators:
             x0 = operator.reset(v0, x0)
         return x0

@@ -24,7 +24,7 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import dynamics as run_dynamics
 from piezo_ident.operators.sections import run_sections, sections_at_rest, sections_of
 
-#: longest pure delay that a model may have [samples]
+#: longest pure delay of a model [samples]
 MAX_DELAY = 1_000_000
 #: upper limit of `Dynamics.memory` [samples], longer than any record
 MAX_MEMORY = 2**40
@@ -33,7 +33,7 @@ MAX_MEMORY = 2**40
 @dataclass(frozen=True)
 class Mode:
     """
-    An oscillating pair of poles in continuous time, with standard deviations of its numbers.
+    Oscillating pair of poles in continuous time, with standard deviations.
 
     The natural frequency is in Hz; the damping is a ratio.
     """
@@ -47,9 +47,9 @@ class Mode:
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """
-    The rational part of G: ``A(z) = 1 + a_1 z^-1 + ...`` and ``B(z) = b_1 + b_2 z^-1 + ...``.
+    Rational part of G: ``A(z) = 1 + a_1 z^-1 + ...`` and ``B(z) = b_1 + b_2 z^-1 + ...``.
 
-    a and b, shapes (na,) and (nb,), are a_1 .. a_na and b_1 .. b_nb.  ModelError when a
+    a and b, shapes (na,) and (nb,), are a_1 .. a_na and b_1 .. b_nb.  Raises ModelError if a
     coefficient is not finite, or b is empty.
     """
 
@@ -67,7 +67,7 @@ class Dynamics:
 
     @classmethod
     def unit(cls) -> Dynamics:
-        """Return G = 1."""
+        """Make G = 1."""
         return cls(a=np.empty(0), b=np.ones(1))
 
     @property
@@ -77,12 +77,12 @@ class Dynamics:
 
     @property
     def gain(self) -> float:
-        """Static gain G(1), infinite for an integrator."""
+        """Static gain G(1); infinite for an integrator."""
         return _static_gain(self.b, self.a)
 
     @cached_property
     def sections(self) -> Array | None:
-        """Sections of second order where eq. (5) would lose digits, shape (n, 5), or nothing."""
+        """Second-order sections, shape (n, 5), if eq. (5) would lose digits; else None."""
         return sections_of(self.a, self.b, self.gain)
 
     @property
@@ -92,7 +92,7 @@ class Dynamics:
 
     @property
     def radius(self) -> float:
-        """Largest magnitude of a pole, 0 without poles."""
+        """Largest magnitude of a pole; 0 without poles."""
         return float(np.abs(self.poles).max(initial=0.0))
 
     @property
@@ -101,11 +101,11 @@ class Dynamics:
         return self.is_within(1.0)
 
     def is_within(self, radius: float) -> bool:
-        """Return whether every pole is smaller than a radius, without looking for the poles."""
+        """Tell whether every pole is smaller than a radius; the poles are not computed."""
         return _is_stable(self.a / radius ** np.arange(1, self.a.size + 1))
 
     def memory(self, share: float) -> int:
-        """Return the samples in which the slowest pole decays to a share of its start."""
+        """Count the samples in which the slowest pole decays to a share of its start."""
         radius = self.radius
         if radius >= 1.0:
             return MAX_MEMORY
@@ -114,7 +114,7 @@ class Dynamics:
         return min(MAX_MEMORY, self.b.size + int(np.log(share) / np.log(radius)))
 
     def normalised(self) -> Dynamics:
-        """Return the same dynamics with G(1) = 1; ModelError for a gain of zero or infinity."""
+        """Scale G to G(1) = 1; raises ModelError for a gain of zero or infinity."""
         gain = self.gain
         if not np.isfinite(gain) or gain == 0.0:
             raise ModelError(f'dynamics: static gain {gain} cannot be scaled to one')
@@ -122,9 +122,10 @@ class Dynamics:
 
     def without_slow_poles(self, slowest: float, sample_rate: float) -> Dynamics:
         """
-        Return the dynamics without real poles below a frequency [Hz] and their nearest zeros.
+        Remove real poles below a frequency [Hz], each with the nearest real zero.
 
-        They have the same gain at ten times that frequency, and are unchanged without such poles.
+        The gain at ten times that frequency stays.  Dynamics without such poles, or with too few
+        real zeros, stay unchanged.
         """
         radius = np.exp(-2.0 * np.pi * slowest / sample_rate)
         poles, zeros = self.poles, np.roots(self.b)
@@ -132,7 +133,7 @@ class Dynamics:
         if not slow.any() or zeros.size < slow.sum():
             return self
         for pole in poles[slow]:
-            # complex zeros come in pairs; only a real one may go alone
+            # complex zeros come in pairs; only a real zero may be removed alone
             real = np.flatnonzero(np.abs(zeros.imag) == 0.0)
             if not real.size:
                 return self
@@ -145,7 +146,7 @@ class Dynamics:
         return Dynamics(a=faster.a, b=faster.b * float(gain[0] * sign[0]))
 
     def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
-        """Return the complex frequency response at frequencies [Hz], shape (n,)."""
+        """Compute the complex frequency response at frequencies [Hz], shape (n,)."""
         z = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) / sample_rate)
         numerator = np.polyval(self.b[::-1], z)
         denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
@@ -153,10 +154,10 @@ class Dynamics:
 
     def modes(self, sample_rate: float, covariance: Array | None = None) -> list[Mode]:
         """
-        Return each oscillating pair of poles as a mode, by frequency.
+        List the oscillating pairs of poles as modes, sorted by frequency.
 
-        With a covariance of (a, b) the modes have standard deviations, else NaN: to first order, a
-        change of a_i moves a pole p by ``-p^(na-i) / A'(p)``.
+        A covariance of (a, b) gives their standard deviations, which are NaN otherwise.  To first
+        order, a change of a_i moves a pole p by ``-p^(na-i) / A'(p)``.
         """
         na = self.a.size
         block = np.full((na, na), math.nan)
@@ -178,9 +179,9 @@ class Dynamics:
 
 def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
     """
-    Return B(z)/A(z) x, shape (n,); a and b as in `Dynamics`.
+    Filter x by B(z)/A(z), shape (n,); a and b as in `Dynamics`.
 
-    `at_rest`: start in equilibrium with the first sample instead of from zero.
+    `at_rest` starts in equilibrium with the first sample instead of from zero.
     """
     past_w, past_y = b.size - 1, a.size
     w, y = np.empty(past_w + x.size), np.empty(past_y + x.size)
@@ -193,8 +194,8 @@ def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
 
 @kernel
 def _is_stable(a: Array) -> bool:
-    # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the last
-    # coefficient is below one in magnitude and the polynomial of one order less passes too
+    # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the magnitude of
+    # the last coefficient is below one and the polynomial of the next lower order passes, too
     a = a.copy()
     for n in range(a.size, 0, -1):
         last = a[n - 1]
@@ -216,8 +217,8 @@ class DynamicsOperator:
     """
     G as an operator.
 
-    b and a, shapes (nb,) and (na,), are the coefficients from the oldest sample to the newest;
-    `change` is as of `piezo_ident.effects.effect.Effect`.
+    b and a, shapes (nb,) and (na,), are the coefficients from the oldest sample to the newest.
+    `change` has the meaning of `piezo_ident.effects.effect.Effect.change`.
     """
 
     change = 'filtered'
@@ -240,7 +241,7 @@ class DynamicsOperator:
         return rest
 
     def process(self, block: Block) -> Block:
-        """Return the block filtered."""
+        """Filter the next block."""
         n, na = block.x.size, self.a.size
         if self._sections is not None:
             out = np.empty(n)
@@ -257,9 +258,9 @@ class DynamicsOperator:
 @dataclass(frozen=True)
 class Delay:
     """
-    The pure delay: whole samples d >= 0, and 0 <= fraction < 1 of one by linear interpolation.
+    Pure delay: whole samples d >= 0, and a fraction 0 <= f < 1 by linear interpolation.
 
-    What is out of range raises ModelError.
+    Raises ModelError if a value is out of range.
     """
 
     samples: int
@@ -275,11 +276,11 @@ class Delay:
 
     @property
     def total(self) -> float:
-        """Delay in samples, with its fraction."""
+        """Delay in samples, including its fraction."""
         return self.samples + self.fraction
 
     def apply(self, x: Array) -> Array:
-        """Return a signal delayed, preceded by its own first value; shape (n,)."""
+        """Delay a signal that was constant before its first sample; shape (n,)."""
         operator = DelayOperator(self)
         operator.reset(0.0, float(x[0]))
         return operator.shift(x)
@@ -300,15 +301,15 @@ class DelayOperator:
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block delayed."""
+        """Delay the next block."""
         return block.with_signal(self.shift(block.x))
 
     def shift(self, x: Array) -> Array:
-        """Return the signal delayed; shape (n,)."""
+        """Delay the next samples of a signal; shape (n,)."""
         if self.delay.total == 0.0:
             return x
         line = np.concatenate([self._past, x])
-        # copied: a view would keep every past block alive
+        # a copy, because a view would keep every past block in memory
         self._past = line[x.size :].copy()
         f = self.delay.fraction
         if f == 0.0:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-H: a polynomial and functions of play operators, with its memory.
+H: a polynomial and functions of play operators, with their memory.
 
     w = p1 v^3 + p2 v + sum_i q_i F_ri[v],        q_i >= 0                           (eqs. 3, 6)
 
@@ -11,14 +11,14 @@ of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised unit
     p0 v^2 + sum_i (c_i1 t_i^2 + c_i2 t_i^3 + c_i3 t_i^4) + sum_i kappa_i (v - low) (F_ri[v] - low)
 
 with ``t_i = F_ri[v] - low``, held between 0 and ``high - low - r_i``.  Functions of the play
-outputs make a Preisach operator whose density at threshold and place (r, F) is their derivative:
+outputs make a Preisach operator.  Its density at threshold and place (r, F) is their derivative:
 Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
-doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are no such operator.
-Either way the memory is that of the plays.
+doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are not a Preisach operator.
+In all these cases the memory consists of the play outputs.
 
-What forgets along the path that the voltage travels, however fast, and has no return points, is
-a semilinear Duhem model: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and
-cubic phi_j.  J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
+A semilinear Duhem model forgets along the path that the voltage travels, at any speed, and has no
+return points: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and cubic phi_j.
+J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
 rate-dependent hysteresis", IEEE Trans. Automatic Control 50(5), 2005,
 doi:10.1109/TAC.2005.847035; Bouc-Wen and Coleman-Hodgdon loops are of this kind.
 """
@@ -37,14 +37,14 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.kernels import hysteresis, relaxing, wide_hysteresis
 from piezo_ident.operators.play import initial_memory
 
-#: powers t^2 .. t^4 that a curve of a play may have
+#: number of powers t^2 .. t^4 in the curve of a play
 POWERS = 3
-#: plays that run side by side in vector lanes; idle ones make up a multiple of it
+#: number of plays that run side by side in vector lanes; idle plays fill up the last group
 LANES = 8
-#: how far a density may fall below zero, as a share of the largest, by rounding
+#: largest negative density that counts as rounding, as a share of the largest density
 ROUNDING = 1e-9
-#: threshold, as a share of the span, below which a play is a line: no converter makes so small a
-#: step
+#: threshold, as a share of the span, below which a play counts as a line: no converter makes so
+#: small a step
 LINE = 1e-9
 
 
@@ -53,8 +53,8 @@ class Hysteresis:
     """
     Parameters of H, in normalised units.
 
-    Since ``F_0[v] = v``, a weight at threshold 0 and `p2` are one parameter: such a weight is
-    folded into `p2`.
+    Since ``F_0[v] = v``, a weight at threshold 0 and `p2` are one parameter.  Such a weight is
+    added to `p2`.
 
     Parameters
     ----------
@@ -65,19 +65,19 @@ class Hysteresis:
     p0 : float, optional
         Square coefficient.
     curves : array_like, shape (m, 1) to (m, 3), optional
-        Coefficients c_i1 .. of t_i^2 .. of each play; its density ``q_i + 2 c_i1 t + ...`` must
+        Coefficients c_i1 .. of t_i^2 .. of each play; the density ``q_i + 2 c_i1 t + ...`` must
         not be negative.
     bias : array_like, shape (m,), optional
         Growth kappa_i of the weight of a play with the voltage.
     span : tuple of float, optional
-        Voltages low and high between which curves and bias hold; beyond, a curve is flat.
+        Voltages low and high between which curves and bias hold; a curve is flat beyond them.
     relaxations : array_like, shape (k, 4), optional
-        Rate a_j, and the coefficients of v, v^2 and v^3 of phi_j, of each lag along the path.
+        Rate a_j of each lag along the path, and the coefficients of v, v^2 and v^3 of its phi_j.
 
     Raises
     ------
     ModelError
-        When lengths differ, a weight or density is negative, or thresholds are negative or not
+        If lengths differ, a weight or density is negative, or thresholds are negative or not
         ascending.
 
     Examples
@@ -162,7 +162,7 @@ class Hysteresis:
 
     @property
     def is_plain(self) -> bool:
-        """Whether H is a cubic and a sum of plays, and no more."""
+        """Whether H is only a cubic and a sum of plays."""
         return not self._is_curved and self.relaxations is None
 
     @property
@@ -171,7 +171,7 @@ class Hysteresis:
 
     @functools.cached_property
     def _wide(self) -> Array:
-        """The rows c_1 .. c_3, kappa and widths of `wide_hysteresis`; none where H is plain."""
+        """Rows c_1 .. c_3, kappa and widths of `wide_hysteresis`; no rows if H has no curves."""
         m, low, high = self.thresholds.size, *self.span
         if not self._is_curved:
             return np.empty((0, m))
@@ -185,7 +185,7 @@ class Hysteresis:
 
     @functools.cached_property
     def for_kernel(self) -> tuple[Array, Array, float, float, float, float, Array]:
-        """``r, q, p1, p2, p0, low, c`` as kernels take them, with idle plays to fill the lanes."""
+        """Arguments ``r, q, p1, p2, p0, low, c`` of the kernels, with idle plays in free lanes."""
         m = self.thresholds.size
         # a frozen array would be another type to the compiler
         rows = np.zeros((2 + len(self._wide), m + -m % LANES))
@@ -193,7 +193,7 @@ class Hysteresis:
         return rows[0], rows[1], self.p1, self.p2, self.p0, self.span[0], rows[2:]
 
     def rise(self, outputs: ArrayLike, v: float = 0.0) -> Array:
-        """Return dw/dF_i of each play at its output, shapes (m,); v matters to a bias alone."""
+        """Compute dw/dF_i of each play at its output, shapes (m,); only a bias depends on v."""
         if not self._is_curved:
             return self.weights
         c1, c2, c3, bias, width = self._wide
@@ -203,21 +203,22 @@ class Hysteresis:
         return np.asarray(self.weights + bias * (v - self.span[0]) + np.where(inside, curved, 0.0))
 
     def lowest_slope(self) -> float:
-        """Return a lower bound of dw/dv over the span; H has an inverse where it is positive."""
+        """Compute a lower bound of dw/dv over the span; H has an inverse if it is positive."""
         return self.flattest[0]
 
     @functools.cached_property
     def flattest(self) -> tuple[float, float]:
-        """A lower bound of dw/dv over the span, and the voltage where it is."""
+        """Lower bound of dw/dv over the span, and the voltage at which it occurs."""
         places, slope = self.slopes(sweeps=self.relaxations is not None)
         k = int(np.argmin(slope))
         return float(slope[k]), float(places[k])
 
     def slopes(self, sweeps: bool) -> tuple[Array, Array]:
         """
-        Return voltages over the span, and the slope behind a turn at each; shapes (k,).
+        Compute voltages over the span, and the slope of H behind a turn at each; shapes (k,).
 
-        With lags along the path, sweeps between any two of nine voltages count, too.
+        `sweeps` adds the slopes along sweeps between any two of nine voltages, as lags along the
+        path need them.
         """
         low, high = self.span
         places = np.linspace(low, high, 129)
@@ -233,19 +234,19 @@ class Hysteresis:
 
     def slope_at_turns(self, v: Array) -> Array:
         """
-        Return a lower bound of dw/dv behind a turn of the voltage, where plays stand; shapes (n,).
+        Bound dw/dv from below behind a turn of the voltage, where plays stand; shapes (n,).
 
-        Plays that are lines move all the same.  Lags along the path have come to rest.
+        Plays that are lines move even there.  Lags along the path count as at rest.
         """
         slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
         low, high = self.span
         r = self.thresholds
         lines = r < LINE * (high - low)
         if lines.any():
-            # a little below the voltage, as a curve is flat beyond its width
+            # slightly below the voltage, as a curve is flat beyond its width
             slope = slope + [float(self.rise(x - 2.0 * r, x)[lines].sum()) for x in v]
         if self.bias is not None:
-            # a play stands anywhere in its band
+            # a play may stand anywhere in its band
             down, up = np.minimum(self.bias, 0.0), np.maximum(self.bias, 0.0)
             least = np.maximum(v[:, None] - low - r, 0.0)
             most = np.minimum(v[:, None] - low, self._wide[4])
@@ -256,11 +257,11 @@ class Hysteresis:
         return np.asarray(slope)
 
     def with_lines(self, count: int) -> Hysteresis:
-        """Return H with its narrowest plays as lines, each of the stroke that the play has."""
+        """Replace the `count` narrowest plays by lines, each with the stroke of its play."""
         low, high = self.span
         r, share = self.thresholds.copy(), np.ones(self.thresholds.size)
         r[:count] *= 0.5 * LINE * (high - low) / r[max(count, 1) - 1]
-        # a line moves over the whole span, a play over what its threshold leaves
+        # a line moves over the whole span, a play over the span minus its threshold
         share[:count] = (high - low - self.thresholds[:count]) / (high - low - r[:count])
         curves, bias = self.curves, self.bias
         if curves is not None:
@@ -270,7 +271,7 @@ class Hysteresis:
         return replace(self, thresholds=r, weights=self.weights * share, curves=curves, bias=bias)
 
     def without_idle(self, nothing: float = 0.0) -> Hysteresis:
-        """Return H without the plays that weigh no more than `nothing` anywhere."""
+        """Drop the plays whose weight nowhere exceeds `nothing`."""
         low, high = self.span
         ends = (self.rise(np.full(self.thresholds.size, low), v) for v in (low, high))
         alive = np.maximum(*ends) > nothing
@@ -285,7 +286,7 @@ class Hysteresis:
         )
 
     def scaled(self, gain: float) -> Hysteresis:
-        """Return H times a gain, which must not be negative."""
+        """Multiply H by a gain >= 0."""
         lags = self.relaxations
         return replace(
             self,
@@ -300,7 +301,7 @@ class Hysteresis:
 
     @property
     def numbers(self) -> Array:
-        """All parameters in a row: r, q, p0, p1, p2, curves, bias."""
+        """All parameters in a row: r, q, p0, p1, p2, curves, bias and widths, then lags."""
         polynomial = np.array([self.p0, self.p1, self.p2])
         parts = [self.thresholds, self.weights, polynomial, self._wide.ravel()]
         if self.relaxations is not None:
@@ -308,15 +309,15 @@ class Hysteresis:
         return np.concatenate(parts)
 
     def initial_memory(self, v0: float) -> Array:
-        """Return the play outputs at `v0` of a stage that last came down to zero."""
+        """Compute the play outputs at `v0` of a stage that last came down to zero."""
         return initial_memory(v0, self.thresholds)
 
     def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> Array:
         """
-        Return w for a normalised input v, shapes (n,).
+        Compute w for a normalised input v, shapes (n,).
 
-        The memory, shape (m,) or (m + k,), holds the play outputs before the first sample, and the
-        lags along the path behind them.
+        The memory, shape (m,) or (m + k,), holds the play outputs before the first sample, and
+        behind them the lags along the path.
         """
         x = np.asarray(v, dtype=np.float64)
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
@@ -324,7 +325,7 @@ class Hysteresis:
 
     @functools.cached_property
     def lag_range(self) -> Array:
-        """Least and largest phi_j over the span, between which a lag stays; shape (2, k)."""
+        """Smallest and largest phi_j over the span, which bound a lag; shape (2, k)."""
         if self.relaxations is None:
             return np.empty((2, 0))
         v = np.linspace(*self.span, 65)
@@ -333,10 +334,10 @@ class Hysteresis:
 
     def settled(self, v0: float) -> Array:
         """
-        Return the lags along the path of a stage that was swept, came down, and went to `v0`.
+        Compute the lags along the path of a stage that was swept, came down, and went to `v0`.
 
-        Behind them, as they are carried on, stands `v0`: shape (k + 1,).  The sweeps are those
-        over the span; the plays of `initial_memory` last came down, too.
+        The sweeps cover the span.  The result, shape (k + 1,), holds the lags and then `v0`, as
+        `follow` expects them.  It fits `initial_memory`, whose plays last came down, too.
         """
         if self.relaxations is None:
             return np.array([v0])
@@ -348,11 +349,11 @@ class Hysteresis:
 
     def follow(self, v: Array, memory: Array) -> tuple[Array, Array]:
         """
-        Return w for the next inputs, shape (n,), and the memory after them.
+        Compute w for the next inputs, shape (n,), and the memory after them.
 
-        That are the play outputs, shape (m,), and behind them the lags along the path; without
-        lags these begin as `settled` at the first input.  Behind the lags stands the last input;
-        without it, shape (m + k,), they begin at the first.
+        The memory holds the play outputs, shape (m,), and behind them the lags along the path and
+        the last input.  Missing lags begin as `settled` at the first input.  A missing last input
+        is taken from the first input.
         """
         x, m = np.ascontiguousarray(v), self.thresholds.size
         out, end = np.empty(x.size), np.zeros(self.for_kernel[0].size)
@@ -374,7 +375,7 @@ class Hysteresis:
 
 
 class HysteresisOperator:
-    """H as an operator, with its memory."""
+    """H as an operator with its memory."""
 
     def __init__(self, hysteresis: Hysteresis, memory: ArrayLike | None = None) -> None:
         self.hysteresis = hysteresis
@@ -382,7 +383,7 @@ class HysteresisOperator:
         m, k = hysteresis.thresholds.size, hysteresis.lag_range.shape[1]
         sizes = {m, m + k, m + k + 1} if k else {m}
         if self._given is not None and (self._given.ndim != 1 or self._given.size not in sizes):
-            also = f', and behind them that of each of {k} lags' if k else ''
+            also = f', and behind them the value of each of {k} lags' if k else ''
             raise ModelError(
                 f'hysteresis: {self._given.size} play outputs at the start for {m} thresholds; '
                 f'give one each{also}'
@@ -390,12 +391,12 @@ class HysteresisOperator:
         self.memory = hysteresis.initial_memory(0.0)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Take the given memory, or the one of a stage that last came down to zero."""
+        """Take the given memory, or the memory of a stage that last came down to zero."""
         start = self.hysteresis.initial_memory(x0) if self._given is None else self._given
         w, self.memory = self.hysteresis.follow(np.array([x0]), start)
         return float(w[0])
 
     def process(self, block: Block) -> Block:
-        """Return the block with H applied to its signal."""
+        """Apply H to the signal of the next block."""
         w, self.memory = self.hysteresis.follow(block.x, self.memory)
         return block.with_signal(w)

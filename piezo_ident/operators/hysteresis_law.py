@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Families of H that are linear in their coefficients, for given thresholds.
+Families (laws) of H that are linear in their coefficients, for given thresholds.
 
-    plays      q_i F_i,  v^3,  v                                  the paper's law, eqs. (3) and (6)
-    square     and v^2
-    bias       square, and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i) (high - v) (F_i - low)
-    preisach   square, and hat_j(r_i) times Bernstein polynomials in F_i as densities
-    duhem      preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates
-    any        all of these terms, from which those of each can be taken
+    plays      q_i F_i,  v^3,  v                                     law of the paper, eqs.  (3),
+    (6) square     and v^2 bias       square, and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i)
+    (high - v) (F_i - low) preisach   square, and hat_j(r_i) times Bernstein polynomials in F_i as
+    densities duhem      preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates
+    any        all of these terms, from which the terms of each law can be selected
 
-hat_j are piecewise linear functions of the threshold on a few even nodes.  All but lags and powers
-of v have coefficients >= 0, so every play keeps a weight >= 0 wherever it stands.  `preisach` is a
-Preisach operator with a density that is smooth along the bias and free along the threshold:
-Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
+hat_j are piecewise linear functions of the threshold on a few even nodes.  All coefficients are >=
+0, except for lags and powers of v.  Every play therefore keeps a weight >= 0 wherever it stands.
+`preisach` is a Preisach operator with a density that is smooth along the bias and free along the
+threshold: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
 doi:10.1007/978-1-4612-4048-8.
 """
 
@@ -36,31 +35,31 @@ from piezo_ident.operators.play import initial_memory
 from scipy.optimize import lsq_linear
 
 LawName = Literal['plays', 'square', 'bias', 'preisach', 'duhem', 'any']
-#: those that a stage may have, from the narrowest to the widest
+#: laws that a stage may have, from the narrowest to the widest
 LAWS: tuple[LawName, ...] = ('plays', 'square', 'bias', 'preisach', 'duhem')
-#: nodes of the hats over the threshold, and degree of the density in the place of a play
+#: number of nodes of the hats over the threshold, and degree of the density over the play output
 NODES, DEGREE = 5, 3
-#: of lags along the path, per span of the voltage
+#: rates of the lags along the path, per span of the voltage
 RATES = (1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 @dataclass(frozen=True, eq=False)
 class HysteresisLaw:
     """
-    A family of H.
+    Family of H that is linear in its coefficients.
 
     Parameters
     ----------
     name : {'plays', 'square', 'bias', 'preisach', 'duhem', 'any'}
     thresholds : array_like, shape (m,)
-        Ascending, above zero, normalised.
+        Thresholds above zero, ascending, normalised.
     span : tuple of float, optional
-        Voltages for which it holds, normalised (`Hysteresis.span`).
+        Voltages for which the law holds, normalised (`Hysteresis.span`).
 
     Raises
     ------
     ModelError
-        When the name is unknown.
+        If the name is unknown.
 
     Examples
     --------
@@ -82,12 +81,12 @@ class HysteresisLaw:
 
     @property
     def densities(self) -> int:
-        """Number of the coefficients that stand first, and are >= 0; lags and powers follow."""
+        """Number of leading coefficients, which are >= 0; lags and powers follow them."""
         return self.size - (2 if self.name == 'plays' else 3) - self.lags
 
     @property
     def lags(self) -> int:
-        """Number of the coefficients of lags along the path."""
+        """Number of coefficients of lags along the path."""
         return 3 * len(RATES) if self.name in ('duhem', 'any') else 0
 
     @property
@@ -102,11 +101,11 @@ class HysteresisLaw:
 
     def roughness(self, density: float, change: float) -> Array:
         """
-        Return what measures the densities, and how much each changes with the place of its play.
+        Compute rows that measure the densities and their change with the place of a play.
 
-        A play of a density `density` measures one.  So does a density `change` that depends on
-        the place, and a difference of neighbouring coefficients of its polynomials; shape
-        (k, size), to be multiplied by coefficients.
+        The product of a row and the coefficients is one in three cases: for a play of the density
+        `density`, for a density `change` that depends on the place, and for a difference `change`
+        of neighbouring coefficients of a polynomial.  The shape is (k, size).
         """
         m, n = self.thresholds.size, self.densities
         size = np.eye(n, self.size) / change
@@ -123,9 +122,10 @@ class HysteresisLaw:
     @functools.cached_property
     def _parameters(self) -> Array:
         """
-        The parameters of H in each coefficient, shape (size, 5 m + 3 + lags).
+        Parameters of H for each coefficient alone, shape (size, 5 m + 3 + lags).
 
-        They are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2, then d_1 .. d_3 of
+        The columns are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2, then d_1 .. d_3
+        of every rate.
         every rate.
         """
         m = self.thresholds.size
@@ -156,7 +156,7 @@ class HysteresisLaw:
         return whole
 
     def _hats(self) -> Iterator[Array]:
-        """Give piecewise linear functions of the threshold, as shares of a density; shape (m,)."""
+        """Yield piecewise linear functions of the threshold as shares of a density; shape (m,)."""
         r = self.thresholds
         if not r.size:
             yield from [r] * NODES
@@ -168,7 +168,7 @@ class HysteresisLaw:
             yield width * np.interp(r, nodes, np.eye(NODES)[j])
 
     def hysteresis(self, coefficients: ArrayLike) -> Hysteresis:
-        """Return the H of coefficients, shape (size,); those below their bound are set on it."""
+        """Make the H of coefficients, shape (size,); values below their bound are set to it."""
         theta = np.maximum(np.asarray(coefficients, dtype=np.float64), self.lower)
         return self._of(theta @ self._parameters, self.thresholds)
 
@@ -192,7 +192,7 @@ class HysteresisLaw:
         )
 
     def deviations(self, covariance: Array) -> Array:
-        """Return the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
+        """Compute the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
         m = self.thresholds.size
         n = (POWERS + 2) * m
         chosen = [*range(m), n + 1, n + 2]
@@ -201,7 +201,7 @@ class HysteresisLaw:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, Mask]]:
-        """Give the H of each coefficient in some places alone, and which thresholds it has."""
+        """Yield for each given coefficient its H alone, and a mask of the thresholds it has."""
         return (self._parts[place] for place in places)
 
     @functools.cached_property
@@ -231,9 +231,10 @@ class HysteresisLaw:
     @functools.cached_property
     def slopes(self) -> Array:
         """
-        What each coefficient adds to the slopes of H, sweeps included; shape (k, size).
+        Contribution of each coefficient to the slopes of H, sweeps included; shape (k, size).
 
-        H rises where they are positive, times coefficients.  Those of `bias` are not linear.
+        H rises if ``slopes @ coefficients`` is positive.  The slopes of `bias` are not linear in
+        the coefficients.
         """
         return np.column_stack([part.slopes(sweeps=True)[1] for part, _ in self._parts])
 
@@ -241,11 +242,11 @@ class HysteresisLaw:
         self, v: Array, memory: ArrayLike | None = None, places: Sequence[int] | None = None
     ) -> Iterator[Array]:
         """
-        Give what H adds for each coefficient under a normalised v; shapes (n,).
+        Yield the contribution to H of each coefficient under a normalised v; shapes (n,).
 
-        The memory, shape (m,), holds the play outputs before the first sample, those of a stage
-        that last came down to zero when absent; `places` are the coefficients that are wanted, all
-        when absent.
+        The memory, shape (m,), holds the play outputs before the first sample; by default these
+        are the outputs of a stage that last came down to zero.  `places` selects coefficients; by
+        default all are computed.
         """
         start = initial_memory(float(v[0]), self.thresholds) if memory is None else memory
         start = np.asarray(start, dtype=np.float64)
@@ -254,9 +255,10 @@ class HysteresisLaw:
 
     def within(self, wider: HysteresisLaw) -> Integers:
         """
-        Return the places of the coefficients among those of a wider law, shape (size,).
+        Find the places of the coefficients among the coefficients of a wider law, shape (size,).
 
-        The wider one has the same thresholds; `duhem` holds all but those of `bias`.
+        The wider law has the same thresholds.  `duhem` holds all coefficients except those of
+        `bias`.
         """
         m, n = self.thresholds.size, wider.densities
         middle = n - NODES * (DEGREE + 1)
@@ -268,9 +270,9 @@ class HysteresisLaw:
 
     def coefficients(self, hysteresis: Hysteresis) -> Array:
         """
-        Return the coefficients of an H of this family, shape (size,).
+        Compute the coefficients of an H of this family, shape (size,).
 
-        ModelError when it has other thresholds, or is none of this family.
+        Raises ModelError if H has other thresholds or does not belong to this family.
         """
         h, m = hysteresis, self.thresholds.size
         if not np.array_equal(h.thresholds, self.thresholds):
@@ -301,7 +303,7 @@ class HysteresisLaw:
 
 
 def _bernstein() -> Iterator[Array]:
-    """Give the coefficients of 1, s, s^2, ... of each Bernstein polynomial on 0 .. 1."""
+    """Yield the coefficients of 1, s, s^2, ... of each Bernstein polynomial on 0 .. 1."""
     for j in range(DEGREE + 1):
         b = np.zeros(DEGREE + 1)
         for power in range(j, DEGREE + 1):

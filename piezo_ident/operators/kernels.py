@@ -2,22 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The compiled loops of H, of G, and of both with the delay in one.
+Compiled loops of H, of G, and of H, G and the delay together.
 
     F_r[v](k) = max(v(k) - r, min(v(k), F_r[v](k-1)))                                  (eqs. 1-2)
     w(k) = p1 v(k)^3 + p2 v(k) + sum_i q_i F_ri[v](k)                                 (eqs. 3, 6)
            [+ p0 v(k)^2 + sum_i psi_i(F_ri[v](k)) + kappa_i (v(k) - low) (F_ri[v](k) - low)]
     y(k) = sum_{j=1..nb} b_j w(k-j+1) - sum_{i=1..na} a_i y(k-i)                      (eqs. 4-5)
 
-of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868; what stands in brackets is that of
-`piezo_ident.operators.hysteresis`.
+of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868; the terms in brackets are explained
+in `piezo_ident.operators.hysteresis`.
 
-Every sum of G runs from the oldest term to the newest wherever a sample stands, so the result does
-not depend on how a stream is cut.  An output of G that has died away is zero
-(`piezo_ident.common.kernel.alive`): without that a stage at rest is 17 times as slow to simulate
-as one that moves.  The test for it would delay every output, so a stretch is first filtered
-without, and again with it where an output died away.  The loops share one file because a compiled
-loop is kept on disk until its own file changes.
+Every sum of G runs from the oldest term to the newest, for every sample of a block.  The result
+therefore does not depend on how a stream is cut.  An output of G that has died away is set to zero
+(`piezo_ident.common.kernel.alive`): otherwise a stage at rest would take 17 times as long to
+simulate as a stage in motion.  The test for zero would delay every output.  A stretch is therefore
+filtered without the test, and filtered again with the test only if an output died away.  The loops
+share one file because a compiled loop is kept on disk until its own file changes.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel, STILL
 
-#: samples that pass the loops while they are in the cache
+#: number of samples that pass the loops while they are in the cache
 STRETCH = 1024
 
 
 @ordered_kernel
 def held(f: float, low: float, high: float) -> float:
-    """Return max(low, min(high, f)): a play moves only as far as its bounds demand."""
-    # comparisons, not max() and min(), whose rules for NaN would keep loops from vectorising
+    """Compute max(low, min(high, f)): a play moves only as far as its bounds demand."""
+    # max() and min() have rules for NaN that keep loops from vectorising; comparisons do not
     f = high if f > high else f
     return low if f < low else f
 
 
 @kernel
 def plays(v: Array, r: Array, memory: Array, out: Array) -> None:
-    """Write F_r[v] of every threshold into `out`, shape (m, n), and carry `memory` on."""
+    """Write F_r[v] of every threshold into `out`, shape (m, n), and update `memory`."""
     for i in range(r.size):
         f = memory[i]
         for k in range(v.size):
@@ -53,7 +53,7 @@ def plays(v: Array, r: Array, memory: Array, out: Array) -> None:
 def hysteresis(
     v: Array, r: Array, q: Array, p1: float, p2: float, memory: Array, out: Array
 ) -> None:
-    """Write w of eqs. (3) and (6) into `out`, shape (n,), and carry `memory` on."""
+    """Write w of eqs. (3) and (6) into `out`, shape (n,), and update `memory`."""
     for k in range(v.size):
         x, w = v[k], 0.0
         for i in range(r.size):
@@ -65,7 +65,7 @@ def hysteresis(
 
 @ordered_kernel
 def curve(c: Array, i: int, t: float) -> float:
-    """Return c_1 t^2 + c_2 t^3 + c_3 t^4 of a play, flat beyond its width (row 4) and below 0."""
+    """Compute c_1 t^2 + c_2 t^3 + c_3 t^4 of a play; flat below 0 and beyond its width (row 4)."""
     t = held(t, 0.0, c[4, i])
     bent: float = t * t * (c[0, i] + t * (c[1, i] + t * c[2, i]))
     return bent
@@ -73,7 +73,7 @@ def curve(c: Array, i: int, t: float) -> float:
 
 @ordered_kernel
 def curve_slope(c: Array, i: int, t: float) -> float:
-    """Return the slope of `curve`."""
+    """Compute the slope of `curve`."""
     slope: float = t * (2.0 * c[0, i] + t * (3.0 * c[1, i] + t * 4.0 * c[2, i]))
     return slope if 0.0 < t < c[4, i] else 0.0
 
@@ -92,7 +92,7 @@ def wide_hysteresis(
     out: Array,
 ) -> None:
     """
-    Do as `hysteresis`, with what stands in brackets above.
+    Write w as `hysteresis` does, with the terms in brackets of the equations above.
 
     The rows of c, shape (5, m), are c_1 .. c_3 of `curve`, kappa, and the widths.
     """
@@ -108,17 +108,17 @@ def wide_hysteresis(
 @ordered_kernel
 def path_lines(x: Array) -> Array:
     """
-    Return what each lag of `relaxing` tends to along a falling and a rising voltage u.
+    Compute the steady answer of each lag of `relaxing` to a falling and to a rising voltage u.
 
-    A line's own answer, in the place of phi: phi - phi' s/a + phi'' (s/a)^2 - ..., as coefficients
-    of 1, u and u^2; shape (2, 3, j).
+    The answer is phi - phi' s/a + phi'' (s/a)^2 - ... with s = -1 for falling and 1 for rising.
+    The result holds its coefficients of 1, u and u^2, shape (2, 3, j); u^3 keeps d_3.
     """
     n = x.shape[0]
     lines = np.empty((2, 3, n))
     for j in range(n):
         d1, d2, d3 = x[j, 1], x[j, 2], x[j, 3]
         for s in range(2):
-            # it changes its sign with the direction
+            # s/a changes its sign with the direction
             b = 1.0 / x[j, 0] if s else -1.0 / x[j, 0]
             lines[s, 0, j] = b * (2.0 * b * d2 - d1 - 6.0 * b * b * d3)
             lines[s, 1, j] = d1 + b * (6.0 * b * d3 - 2.0 * d2)
@@ -130,7 +130,7 @@ def path_lines(x: Array) -> Array:
 def lag_after(
     z: float, c0: float, c1: float, c2: float, d3: float, last: float, u: float, left: float
 ) -> float:
-    """Return a lag after the voltage went to u, of whose distance to its line a share is left."""
+    """Move a lag with the voltage to u; its distance to the steady answer shrinks to a share."""
     new = c0 + u * (c1 + u * (c2 + u * d3))
     old = c0 + last * (c1 + last * (c2 + last * d3))
     return new + (z - old) * left
@@ -139,11 +139,11 @@ def lag_after(
 @kernel
 def relaxing(v: Array, x: Array, state: Array, out: Array) -> None:
     """
-    Add the lags along the path of v to `out`, and carry `state` on.
+    Add the lags along the path of v to `out`, and update `state`.
 
-    Rows of x, shape (j, 4), are a rate a and d_1 .. d_3 of ``phi(v) = d_1 v + d_2 v^2 + d_3 v^3``;
-    each adds ``z - phi(v)`` with ``dz = a |dv| (phi(v) - z)``, exact for straight lines between
-    the samples.  `state` holds each z, and then the last v.
+    Rows of x, shape (j, 4), are a rate a and d_1 .. d_3 of ``phi(v) = d_1 v + d_2 v^2 + d_3 v^3``.
+    Each row adds ``z - phi(v)`` with ``dz = a |dv| (phi(v) - z)``, exactly for straight lines
+    between the samples.  `state` holds each z, and then the last v.
     """
     n = x.shape[0]
     lines = path_lines(x)
@@ -156,7 +156,7 @@ def relaxing(v: Array, x: Array, state: Array, out: Array) -> None:
         for j in range(n):
             a, d1, d2, d3 = x[j, 0], x[j, 1], x[j, 2], x[j, 3]
             if length > 0.0:
-                # of twice the rate the square is left; an exponential takes ten times as long
+                # at twice the rate the remaining share is the square; exp takes ten times as long
                 left = left * left if a == 2.0 * before else np.exp(-a * length)
                 before = a
                 c0, c1, c2 = line[0, j], line[1, j], line[2, j]
@@ -173,8 +173,8 @@ def dynamics(w: Array, b: Array, a: Array, y: Array) -> None:
     Continue y by eqs. (4) and (5), without the delay.
 
     w, shape (nb - 1 + n,), begins with the earlier samples, and y, shape (na + n,), with the
-    earlier outputs.  The coefficients b_nb .. b_1 and a_na .. a_1 go from the oldest sample to the
-    newest.
+    earlier outputs.  The coefficients b_nb .. b_1 and a_na .. a_1 run from the oldest sample to
+    the newest.
     """
     nb, na = b.size, a.size
     for start in range(0, y.size - na, STRETCH):
@@ -192,7 +192,7 @@ def _forward(w: Array, b: Array, y: Array) -> None:
     y[:] = 0.0
     n, nb = y.size, b.size
     fours = nb - nb % 4
-    # slices, whose indices cannot be negative, let the loops run in vector lanes
+    # slices have no negative indices, which lets the compiler vectorise the loops
     for j in range(0, fours, 4):
         past = w[j : j + n + 3]
         b0, b1, b2, b3 = b[j], b[j + 1], b[j + 2], b[j + 3]
@@ -210,7 +210,7 @@ def _backward(a: Array, y: Array) -> None:
     na, n = a.size, y.size - a.size
     if na == 0:
         return
-    # four outputs side by side: each waits for those before it in its last three terms only
+    # four outputs side by side: an output waits for the outputs before it in three terms only
     whole = n - n % 4 if na > 3 else 0
     for k in range(0, whole, 4):
         new = y[k : k + na + 4]
@@ -236,7 +236,7 @@ def _backward(a: Array, y: Array) -> None:
 
 @ordered_kernel
 def _dies_away(y: Array) -> bool:
-    # counted by index, not looked for: that runs in vector lanes
+    # a count over all samples vectorises; a search that stops at the first hit does not
     count = 0
     for k in range(y.size):
         count += (abs(y[k]) < STILL) & (y[k] != 0.0)
@@ -274,26 +274,26 @@ def cascade(
     out: Array,
 ) -> None:
     """
-    Pass a voltage through H, G and the delay, and carry their states on.
+    Pass a voltage through H, G and the delay, and update their states.
 
     Parameters
     ----------
     v, out : ndarray, shape (n,)
-        [V] and [m].
+        Voltage [V] and displacement [m].
     scale : ndarray, shape (4,)
         v0, V, y0 and Y.
     r, q, p1, p2, p0, low, c, lags
-        As in `wide_hysteresis` and `relaxing`; without rows of c, as in `hysteresis`.
+        As in `wide_hysteresis` and `relaxing`; as in `hysteresis` if c has no rows.
     memory : ndarray
-        Of the plays, shape (m,), and behind it that of the lags.
+        Memory of the plays, shape (m,), and behind it the memory of the lags.
     b, a
         As in `dynamics`.
     w : ndarray, shape (nb - 1 + k,)
-        Last outputs of H, and room for k new ones.
+        Last outputs of H, and room for k new outputs.
     y : ndarray, shape (past + k,), past >= na, past > d
-        Last outputs of G, and the same room.
+        Last outputs of G, and room for k new outputs.
     d, fraction : int and float
-        The delay [samples].
+        Delay [samples].
     """
     v0, V, y0, Y = scale[0], scale[1], scale[2], scale[3]
     past_w = b.size - 1
@@ -317,7 +317,7 @@ def cascade(
         for k in range(n):
             x = now[k] if fraction == 0.0 else (1.0 - fraction) * now[k] + fraction * before[k]
             new[k] = y0 + Y * x
-        # from front to back, so that no sample is overwritten before it has moved
+        # move from front to back, so that no sample is overwritten before it has moved
         for k in range(past_w):
             w[k] = w[n + k]
         for k in range(past_y):

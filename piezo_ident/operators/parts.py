@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What parts of H make of one input, each alone.
+Compute the outputs of single parts of H for one input.
 
-A fit asks for a column for each coefficient of a law of H.  Parts that follow each other often
-hold the same plays, with other curves, or lags of one rate: those run side by side, so that plays
-and exponentials are computed once.
+A fit needs a column for each coefficient of a law of H.  Consecutive parts often hold the same
+plays with other curves, or lags of the same rate.  Such parts run side by side, so that plays and
+exponentials are computed once.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.kernels import held, lag_after, path_lines
 from piezo_ident.operators.play import play_columns
 
-#: parts that run side by side
+#: number of parts that run side by side
 SIDE_BY_SIDE = 4
 
-#: a part of H, and the outputs of its plays before the first sample, shape (m,)
+#: part of H, and the outputs of its plays before the first sample, shape (m,)
 Part = tuple[Hysteresis, Array]
 
 
 def in_groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
-    """Give up to `SIDE_BY_SIDE` parts in a row that hold the same plays, or lags of one rate."""
+    """Group up to `SIDE_BY_SIDE` consecutive parts with the same plays, or lags of one rate."""
     for _, some in itertools.groupby(parts, _kind):
         group = list(some)
         for k in range(0, len(group), SIDE_BY_SIDE):
@@ -38,22 +38,22 @@ def in_groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
 
 
 def has_curves_alone(h: Hysteresis) -> bool:
-    """Return whether H is plays with curves, and no more."""
+    """Tell whether H consists of plays with curves only."""
     others = (h.p0, h.p1, h.p2) == (0.0, 0.0, 0.0) and h.bias is None and h.relaxations is None
     return others and h.curves is not None
 
 
 def is_single_play(h: Hysteresis) -> bool:
-    """Return whether H is one play, and no more."""
+    """Tell whether H consists of one play only."""
     return h.is_plain and h.thresholds.size == 1 and (h.p1, h.p2) == (0.0, 0.0)
 
 
 def weights_of(group: list[Part]) -> tuple[Array, Array]:
     """
-    Return weights and curves of a group as `four_sums` takes them.
+    Collect weights and curves of a group as `four_sums` takes them.
 
-    Shapes (`SIDE_BY_SIDE`, m) and (`SIDE_BY_SIDE`, 5, m), m with idle plays; parts that are
-    missing weigh nothing.
+    Their shapes are (`SIDE_BY_SIDE`, m) and (`SIDE_BY_SIDE`, 5, m), where m includes idle plays.
+    A missing part has zero weights.
     """
     r, *_, c = group[0][0].for_kernel
     q, curves = np.zeros((SIDE_BY_SIDE, r.size)), np.zeros((SIDE_BY_SIDE, *c.shape))
@@ -66,9 +66,9 @@ def columns_of_parts(
     v: Array, parts: Iterable[Part], rest: float | None = None
 ) -> Iterator[Array]:
     """
-    Give what each part of H makes of a normalised input; shapes (n,).
+    Yield the output of each part of H for a normalised input; shapes (n,).
 
-    Lags along the path begin as `Hysteresis.settled` at `rest`, at the first input when absent.
+    Lags along the path begin as `Hysteresis.settled` at `rest`, by default at the first input.
 
     Examples
     --------
@@ -87,7 +87,7 @@ def columns_of_parts(
             _plays_apart(x, r, low, *weights_of(group), held_at, out)
             yield from out[: len(group)]
         elif is_single_play(h):
-            # a play runs faster by itself
+            # a single play runs faster by itself
             for one, before in group:
                 yield one.weights[0] * play_columns(x, one.thresholds, before)[0]
         elif _is_lags_alone(h):
@@ -116,12 +116,12 @@ def _is_lags_alone(h: Hysteresis) -> bool:
 @part_of_kernels
 def four_sums(low: float, q: Array, c: Array, memory: Array) -> tuple[float, float, float, float]:
     """
-    Return ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
+    Compute ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
 
-    psi is `piezo_ident.operators.kernels.curve`; q and c are those of `weights_of`.  Kernels of
-    other files hold it as it was when their own file changed last.
+    psi is `piezo_ident.operators.kernels.curve`; q and c come from `weights_of`.  A kernel of
+    another file keeps the version of this function at the last change of its own file.
     """
-    # written out, so that the loop over plays runs in vector lanes
+    # the sums are written out, so that the loop over plays vectorises
     s_0, s_1, s_2, s_3 = 0.0, 0.0, 0.0, 0.0
     for i in range(memory.size):
         f = memory[i]
@@ -147,7 +147,7 @@ def _plays_apart(
 
 @ordered_kernel
 def _lags_apart(v: Array, x: Array, state: Array, out: Array) -> None:
-    # as `piezo_ident.operators.kernels.relaxing`, of lags of one rate that are not added up
+    # as `piezo_ident.operators.kernels.relaxing`, for lags of one rate that are not added up
     n = x.shape[0]
     lines = path_lines(x)
     last = float(state[n])

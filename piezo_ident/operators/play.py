@@ -20,9 +20,9 @@ from piezo_ident.operators.kernels import plays
 
 def initial_memory(v0: float, thresholds: ArrayLike) -> Array:
     """
-    Return the play outputs of a stage that last came down to zero and then went to `v0`.
+    Compute the play outputs of a stage that last came down to zero and then went to `v0`.
 
-    That is the state ``F_r = 0`` at ``v = 0`` of the paper, moved to `v0` in one stroke.  Voltage
+    This is the state ``F_r = 0`` at ``v = 0`` of the paper, moved to `v0` in one stroke.  Voltage
     and thresholds, shape (m,), are normalised.
     """
     r = np.asarray(thresholds, dtype=np.float64)
@@ -31,7 +31,7 @@ def initial_memory(v0: float, thresholds: ArrayLike) -> Array:
 
 def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None = None) -> Array:
     """
-    Return the output of every play operator.
+    Compute the output of every play operator.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None =
     thresholds : array_like, shape (m,)
         Thresholds r >= 0.
     memory : array_like, shape (m,), optional
-        Outputs before the first sample; `initial_memory` of the first input when absent.
+        Outputs before the first sample; by default `initial_memory` of the first input.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None =
     [[0.0, 0.75, 0.0]]
     """
     x = np.ascontiguousarray(v, dtype=np.float64)
-    # a frozen array would be another type to the compiler
+    # a copy, as a frozen array would be another type to the compiler
     r = np.array(thresholds, dtype=np.float64)
     start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
     out = np.empty((r.size, x.size))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-G as a cascade of sections of second order, where eq. (5) would lose digits.
+Run G as a cascade of second-order sections if eq. (5) would lose digits.
 
-Each output of eq. (5) is rounded, and what is rounded off passes through 1/A like a noise: a G
-with many lightly damped modes makes 1e-10 of stroke of it.  What a section rounds off passes
-through two poles and the sections behind alone: the same G then keeps 1e-13.
+Each output of eq.  (5) is rounded, and the rounding error passes through 1/A like noise.  A G with
+many lightly damped modes amplifies it to 1e-10 of the stroke.  The rounding error of a section
+only passes through two poles and the sections behind it: the same G then keeps 1e-13.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from piezo_ident.common.kernel import alive, ordered_kernel
 
 #: share of the output that eq. (5) may lose by rounding
 LOST = 2e-14
-#: difference of the static gain of sections from that of G, and of their products from B and A, as
-#: shares, beyond which their roots are not to be trusted
+#: largest relative error of the sections: of their static gain, and of their products against B
+#: and A; beyond it the roots are too inaccurate
 NEAR, SAME = 1e-2, 1e-12
-#: share of the largest b up to which the first counts as zero: its roots overflow
+#: share of the largest b up to which the first b counts as zero: its roots would overflow
 NOTHING = 1e-300
-#: samples after which a state that has died away is set to zero
+#: number of samples after which a state that has died away is set to zero
 STRETCH = 1024
 
 
 def rounding_of(a: Array) -> float:
     """
-    Return the rounding error of eq. (5) as a share of its output, rms, about.
+    Estimate the rms rounding error of eq. (5) as a share of its output.
 
-    That of one output times the rms gain of 1/A, which is the product of 1 / sqrt(1 - k^2) over
-    its reflection coefficients k; infinite for an unstable G.
+    It is the rounding of one output times the rms gain of 1/A.  This gain is the product of
+    1 / sqrt(1 - k^2) over its reflection coefficients k; infinite for an unstable G.
     """
     size, power, rest = 1.0 + float(a @ a), 1.0, a
     while rest.size:
@@ -48,24 +48,24 @@ def rounding_of(a: Array) -> float:
 
 def sections_of(a: Array, b: Array, gain: float) -> Array | None:
     """
-    Return G as sections, or nothing where eq. (5) serves.
+    Factor G into sections; None if eq. (5) is accurate enough.
 
-    The sections, shape (n, 5), are b_0, b_1, b_2, a_1 and a_2 of each; they keep the static gain
-    to the last digit.
+    A row of the sections, shape (n, 5), holds b_0, b_1, b_2, a_1 and a_2.  The sections keep the
+    static gain to the last digit.
     """
     begins = abs(b[0]) > NOTHING * np.abs(b).max()
     if not begins or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:
         return None
-    # few models need it, and it takes half a second to import
+    # few models need scipy.signal, and its import takes half a second
     from scipy.signal import zpk2sos
 
     whole = np.concatenate([[1.0], a])
     made = zpk2sos(np.roots(b), np.roots(whole), b[0])
-    # of a B that begins with next to nothing one zero is far out, and the others are lost
+    # if B begins with a tiny coefficient, one zero is far out, and the other zeros are inaccurate
     if not (_is_product(made[:, :3], b) and _is_product(made[:, 3:], whole)):
         return None
     static = float(np.prod(made[:, :3].sum(axis=1) / made[:, 3:].sum(axis=1)))
-    # roots beside each other may be too rough themselves
+    # roots close to each other may be too inaccurate as well
     if not abs(gain - static) < NEAR * abs(static):
         return None
     made[0, :3] *= gain / static
@@ -81,7 +81,7 @@ def _is_product(parts: Array, whole: Array) -> bool:
 
 
 def sections_at_rest(c: Array, x: float) -> tuple[Array, float]:
-    """Return the state of sections at rest under x, shape (n, 2), and what goes out."""
+    """Compute the state of sections at rest under x, shape (n, 2), and their output."""
     z = np.empty((c.shape[0], 2))
     for i, (b0, b1, b2, a1, a2) in enumerate(c):
         y = x * (b0 + b1 + b2) / (1.0 + a1 + a2)
@@ -92,7 +92,7 @@ def sections_at_rest(c: Array, x: float) -> tuple[Array, float]:
 
 @ordered_kernel
 def run_sections(x: Array, c: Array, z: Array, out: Array) -> None:
-    """Write what sections make of x to `out`, shape (n,), and carry z on, shape (n, 2)."""
+    """Write the output of sections for x to `out`, shape (n,), and update z, shape (n, 2)."""
     for start in range(0, x.size, STRETCH):
         for k in range(start, min(start + STRETCH, x.size)):
             u = x[k]
@@ -102,6 +102,6 @@ def run_sections(x: Array, c: Array, z: Array, out: Array) -> None:
                 z[i, 1] = c[i, 2] * u - c[i, 4] * y
                 u = y
             out[k] = u
-        # a test in every sample would delay the next one
+        # a test in every sample would delay the next sample
         for i in range(c.shape[0]):
             z[i, 0], z[i, 1] = alive(z[i, 0]), alive(z[i, 1])
