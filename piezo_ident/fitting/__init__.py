@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One fit by free-run error.
+Fit a stage by free-run error.
 
-`stretch` holds what was measured, `stage` the numbers and their derivatives, `free_run` the
+`stretch` holds the measured motion, `stage` the parameters and their derivatives, `free_run` the
 Gauss-Newton loop, `equations` the normal equations block by block.
 """

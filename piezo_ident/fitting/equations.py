@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Normal equations of a linearised fit, block by block.
+Build and solve the normal equations of a linearised fit, block by block.
 
-With the columns M_k, the residual e_k of every block k, and the weights W_k of its rows,
+For the columns M_k, the residual e_k and the row weights W_k of every block k they are
 
     A_k = M_k' W_k M_k,      b_k = M_k' W_k e_k,      s_k = e_k' W_k e_k.
 
-A set of blocks is left out by a subtraction, and its error needs no sample again:
+A set of blocks is left out by a subtraction, and its error needs no samples:
 
     theta = (sum_train A + D)^-1 sum_train b,      E_k = s_k - 2 b_k' theta + theta' A_k theta.
 """
@@ -23,10 +23,10 @@ from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear, nnls
 
 #: share of the energy of a column that is added to the diagonal, so that rounding cannot make it
-#: negative: single precision of the products of double precision numbers
+#: negative: the products of double precision numbers keep single precision
 RIDGE = 1e-10
-#: by how much a row may be undercut, a rounding error of slopes about one, and rows that may be
-#: held in one step
+#: largest violation of a row, a rounding error of slopes of about one, and most rows that one step
+#: may hold
 UNDERCUT, CUTS = 1e-7, 40
 
 
@@ -52,11 +52,11 @@ class Equations:
         rising: tuple[Array, Array] | None = None,
     ) -> Array:
         """
-        Return the sum of squares of every block, predicted from the other sets; shape (n_b,).
+        Predict every block from the other sets, and sum its squared errors; shape (n_b,).
 
-        Blocks of one number in `sets`, shape (n_b,), are left out together, those of -1 never.
-        The prior, shape (p, p), is what is known of the step before; bounds and `rising` are those
-        of `bounded_step`.
+        Blocks with the same number in `sets`, shape (n_b,), are left out together.  Blocks with
+        the number -1 stay in every fit.  The prior, shape (p, p), is the information before the
+        fit.  Bounds and `rising` are those of `bounded_step`.
         """
         A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
         errors = self.s.copy()
@@ -68,7 +68,7 @@ class Equations:
             A_in, b_in = A - A_out.sum(axis=0), b - b_out.sum(axis=0)
             theta = bounded_step(A_in, b_in, lower, upper, rising=rising)
             errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
-        # far from its minimum a fit promises by its derivatives what it does not keep
+        # far from its minimum the linear prediction fails, and could claim less than the fit error
         return np.asarray(np.maximum(errors, self.s))
 
 
@@ -83,11 +83,11 @@ def bounded_step(
     rising: tuple[Array, Array] | None = None,
 ) -> Array:
     """
-    Return the step that minimises ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; shape (p,).
+    Minimise ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; the step has shape (p,).
 
-    `damping` is a share of the energy of each column.  With `rising`, rows of shape (k, p) and
-    the least of each, shape (k,), ``rows x`` is no less either, where there is such an x.
-    Equations that are no numbers raise IdentificationError.
+    `damping` is a share of the energy of each column.  `rising` holds rows, shape (k, p), and the
+    smallest allowed value of each row, shape (k,): ``rows x`` is at least that, if such an x
+    exists.  Raises IdentificationError if the equations are not finite.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def bounded_step(
     energy = np.diag(A)
     size = np.sqrt(np.where(energy > 0.0, energy, 1.0))
     scaled = A / np.outer(size, size)
-    # a column of zeros stays where it is
+    # a column of zeros keeps its parameter unchanged
     more = RIDGE + damping + np.where(energy > 0.0, 0.0, 1.0) + prior / size**2
     scaled[np.diag_indices_from(scaled)] += more
     wide = upper > lower
@@ -110,7 +110,7 @@ def bounded_step(
         with np.errstate(divide='ignore', invalid='ignore'):
             x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='bvls').x
         if not np.isfinite(x).all():
-            # an active set that is a rounding error away from its bound divides by zero
+            # bvls divides by zero if an active set is within rounding of its bound
             x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='trf').x
         if rising is not None:
             rows = (rising[0] / size)[:, wide]
@@ -131,10 +131,10 @@ def _no_less(
     rising: tuple[Array, Array],
 ) -> Array:
     """
-    Return the x inside bounds that minimises ``|M x - target|`` where ``rows x`` is no less.
+    Minimise ``|M x - target|`` inside bounds, with ``rows x`` at least as large as required.
 
-    The row that is undercut most joins the inequalities in turn.  They are met by the problem of
-    the least distance: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974,
+    In each turn the most violated row joins the inequalities.  The problem of least distance then
+    meets them: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974,
     chapter 23, doi:10.1137/1.9781611971217.
     """
     (lower, upper), (rows, least) = bounds, rising
@@ -150,7 +150,7 @@ def _no_less(
             break
         E, f = np.vstack([E, rows[k]]), np.append(f, least[k])
         G, h = np.linalg.solve(R.T, E.T), f - E @ middle
-        # the farthest half-space gives the unit of the distance
+        # the distance of the farthest half-space is the unit of the distance
         unit = float(np.max(h / np.linalg.norm(G, axis=0)))
         system, last = np.vstack([G, h / unit]), np.eye(x.size + 1)[-1]
         try:
@@ -158,7 +158,7 @@ def _no_less(
         except RuntimeError:
             break
         if not left[-1] > RIDGE:
-            # no x meets them all
+            # no x meets all inequalities
             break
         x = middle - unit * np.linalg.solve(R, left[:-1] / left[-1])
     return x

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The fit: Gauss-Newton on the free-run error, inside bounds, with priors and damping.
+Fit a stage by Gauss-Newton on the free-run error, inside bounds, with priors and damping.
 
 Damping after D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
-doi:10.1137/0111030.  What is linear, the weights of H above all, is found exactly within a step:
-the step is a bounded least-squares problem of all values together.
+doi:10.1137/0111030.  Each step solves one bounded least-squares problem for all parameters
+together.  It therefore finds the linear parameters, mainly the weights of H, exactly.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from piezo_ident.fitting.equations import bounded_step, Equations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
-#: first damping, a share of the energy of each column, its factors, and where a step is given up
+#: first damping, as a share of the energy of each column; its factors after a step that failed and
+#: after a step that helped; its smallest value; and the value at which the fit gives up
 DAMPING, WORSE, BETTER, LEAST, MOST = 1e-4, 5.0, 0.1, 1e-9, 1e6
-#: the fit ends when a step lowers the loss, or promises to, by less than this share
+#: the fit ends if a step lowers the loss, or promises to, by less than this share
 SLOW = 1e-4
-#: independent observations in a block: neighbouring residuals are alike (taste)
+#: independent observations in a block, as neighbouring residuals are alike (taste)
 OBSERVATIONS = 5.0
 
 
@@ -39,11 +40,11 @@ class Fit:
     ----------
     stage : Stage
     loss : float
-        Sum of squares of what is left of the samples that count, normalised.
+        Sum of squared residuals over the samples that count, normalised.
     equations : Equations
-        Linearised at the result, block by block.
+        Normal equations at the result, block by block.
     iterations : int
-        Steps that were taken.
+        Number of steps.
     """
 
     stage: Stage
@@ -53,26 +54,26 @@ class Fit:
 
     @property
     def n(self) -> int:
-        """Samples that count."""
+        """Number of samples that count."""
         return int(self.equations.rows.sum())
 
     @property
     def rms(self) -> float:
-        """Root mean square of what is left, normalised."""
+        """Root mean square of the residual, normalised."""
         return float(np.sqrt(self.loss / max(self.n, 1)))
 
     def prior_weight(self) -> Array:
-        """Return what the prior adds to the equations, shape (p, p)."""
+        """Compute the information that the prior adds to the equations, shape (p, p)."""
         return _prior_weight(self.stage, self.loss, self.equations.rows)
 
     def held_out(self, sets: Integers) -> Array:
-        """Return the sum of squares of each block, predicted from the other sets; shape (n_b,)."""
+        """Predict every block from the other sets, and sum its squared errors; shape (n_b,)."""
         values, (lower, upper) = self.stage.values, self.stage.bounds
         bounds = lower - values, upper - values
         return self.equations.held_out(sets, self.prior_weight(), *bounds, self.stage.rising)
 
     def covariance(self) -> Array:
-        """Return the covariance of the values, for white residuals; zero on a bound."""
+        """Compute the covariance of the values for white residuals; zero on a bound."""
         free = self.stage.free(self.stage.values)
         A = self.equations.A.sum(axis=0)[np.ix_(free, free)]
         size = np.sqrt(np.maximum(np.diag(A), np.finfo(float).tiny))
@@ -83,7 +84,7 @@ class Fit:
 
 
 def residuals(stage: Stage, stretches: Sequence[Stretch]) -> list[Array]:
-    """Return measured minus predicted of each stretch, shapes (n,)."""
+    """Compute measured minus predicted displacement of each stretch, shapes (n,)."""
     return [s.x - stage.signals(s)[2] - stage.added(s) for s in stretches]
 
 
@@ -95,22 +96,22 @@ def fit(
     tick: Callable[[], None] = lambda: None,
 ) -> Fit:
     """
-    Fit all numbers of a stage.
+    Fit all parameters of a stage.
 
     Parameters
     ----------
     stage : Stage
-        Where the fit starts; orders, delay, thresholds and time constants stay.
+        Start of the fit; orders, delay, thresholds and time constants are kept.
     stretches : sequence of Stretch
     iterations : int, optional
         Most steps.
     tick : callable, optional
-        Called once a step; may raise to stop the work.
+        Called once a step; it may raise to stop the work.
 
     Raises
     ------
     IdentificationError
-        When no sample counts, or the start predicts no finite number.
+        If no sample counts, or the prediction of the start is not finite.
     """
     if not any(s.use.any() for s in stretches):
         raise IdentificationError('no sample is left to fit; hold out less')
@@ -136,7 +137,7 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A stage, its signals on each stretch, and its sum of squares."""
+    """Stage with its signals on each stretch, and its sum of squares."""
 
     stage: Stage
     signals: Sequence[tuple[Array, Array, Array]]
@@ -151,7 +152,7 @@ def _at(stage: Stage, stretches: Sequence[Stretch]) -> _Point:
 def _step(
     here: _Point, equations: Equations, stretches: Sequence[Stretch], damping: float
 ) -> tuple[_Point | None, float, float]:
-    """Return the first point that is better, by how much, and its damping; None for none."""
+    """Find the first better point with its gain and its damping; None if no step helps."""
     values, (lower, upper) = here.stage.values, here.stage.bounds
     middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
     A = equations.A.sum(axis=0) + weight
@@ -175,7 +176,7 @@ def _step(
 
 
 def _height(away: Array, weight: Array) -> float:
-    """Return what a prior adds to the loss."""
+    """Compute the contribution of a prior to the loss."""
     return float(away @ weight @ away)
 
 
@@ -197,7 +198,7 @@ def _loss(
 
 
 def _linearised(here: _Point, stretches: Sequence[Stretch]) -> Equations:
-    """Return the normal equations of all stretches, block by block."""
+    """Compute the normal equations of all stretches, block by block."""
     count = 1 + max(int(s.block[-1]) for s in stretches)
     stage = here.stage
     p = stage.values.size

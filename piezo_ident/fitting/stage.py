@@ -2,31 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A stage of one axis as a free-run fit sees it: its numbers, its prediction, and the derivatives.
+Stage of one axis in a free-run fit: its parameters, its prediction, and the derivatives.
 
     h = sum_j c_j phi_j[v]                               columns of a law of H
     w = h + sum_k s_k L_k h                              creep, L_k = 1 / (1 + tau_k p)
     y = B(z)/A(z) z^-d w + offset + sum_k s_k l_k exp(-t / tau_k)
 
-The numbers are c, s, a and b, the offset of each record, the lags l_k of creep at the first sample
-of each stretch, and the memory at the start of each record,
+The parameters are c, s, a and b, the offset of each record, the lags l_k of creep at the first
+sample of each stretch, and the memory at the start of each record,
 
     F_r(0) = v(0) - int_0^r m(r') dr',      0 <= m <= 1,
 
 with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
-begins with m = 0 and l = 0, as a simulation does: freed, both would take what H errs by.  With
-`rested` false l is free there, too: a voltage at rest tells nothing of creep from before.
+begins with m = 0 and l = 0, as a simulation does: free values of both would absorb errors of H.
+If `rested` is false, l is free there, too: a resting voltage does not exclude creep from before.
 
 With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
 signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999), section 10.3.
 
-H rises with the voltage.  Right behind a turning point only its powers of v move; their slope is
-a quadratic in v, and its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and t^2 with t
-from 0 to 1 over the span of the law, are the numbers of the fit, at least `LEAST_SLOPE` each.
-With lags along the path the slope depends on all that came before.  It is linear in c all the
-same, and at least as large on sweeps between any two of a few voltages.  What lies below already,
-as a gain of G lowers it on its way into H, may stay: a step that had to mend it first would lead
-up, and the fit would end where it began.
+H rises with the voltage.  Right behind a turning point only its powers of v move.  Their slope is
+a quadratic in v.  The fit uses its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and
+t^2 with t from 0 to 1 over the span of the law, each at least `LEAST_SLOPE`.  With lags along the
+path the slope depends on the whole past.  It is still linear in c, and is held above
+`LEAST_SLOPE` on sweeps between any two of a few voltages.  A slope may already be smaller, because
+the gain of G that moves into H lowers it.  It may then stay: a step that had to raise it first
+could increase the loss, and the fit would end at its start.
 """
 
 from __future__ import annotations
@@ -47,49 +47,49 @@ from piezo_ident.operators.play import play_columns
 
 #: poles beyond this radius count as unstable: they would ring for longer than any record
 RADIUS = 0.99999
-#: parts of the memory at a start (taste: a record tells a few numbers of it)
+#: number of parts of the memory at a start (taste: a record tells only a few)
 PARTS = 6
-#: least slope of H behind a turning point, share of stroke over range; piezo ceramics have more
-#: than a third, and an inverse would jump where it is zero (taste)
+#: smallest slope of H behind a turning point, as a share of stroke over range; piezo ceramics have
+#: more than a third, and an inverse would jump at a slope of zero (taste)
 LEAST_SLOPE = 0.05
 #: largest share of one element of creep: piezo ceramics creep by 1 to 5 % of a step in all
 MOST_CREEP = 0.1
-#: rms size of a share, known before; of a lag of creep, a share of the range; and of a share of
-#: the memory at a start about its first guess
+#: prior rms of the share of an element of creep, of a lag of creep as a share of the range, and of
+#: a share of the memory at a start around its first guess
 CREEP_SPREAD, LAG_SPREAD, START_SPREAD = 0.02, 0.5, 0.5
-#: rms density of H, known before: the even density that makes the whole stroke over the range;
-#: and how much the density, and the slope behind a turning point, change over the range (taste:
-#: a quarter of that density, a third of the mean slope)
+#: prior rms of the density of H, twice the even density that would make the whole stroke, and of
+#: the changes of the density and of the slope behind a turning point over the range (taste: a
+#: quarter of that density, a third of the mean slope)
 DENSITY_SPREAD, DENSITY_CHANGE, SLOPE_CHANGE = 2.0, 0.5, 0.3
-#: step of the finite difference by a share of the memory
+#: step of the finite difference over a share of the memory
 STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
     """
-    Numbers of a stage, normalised; G has gain one.
+    Parameters of a stage, normalised; G has gain one.
 
     Attributes
     ----------
     law : HysteresisLaw
     coefficients : ndarray, shape (size,)
-        Of the law.
+        Coefficients of the law.
     dynamics : Dynamics
-        G without its delay; ``Dynamics.unit()`` has no free number.
+        G without its delay; ``Dynamics.unit()`` has no free parameter.
     delay : int
-        [samples]
+        Delay [samples].
     offsets : ndarray, shape (records,)
     taus, creep : ndarray, shape (k,)
         Time constants of creep [s] and their shares.
     lags : ndarray, shape (stretches, k)
-        How far each element of creep is from its rest at the first sample.
+        Distance of each element of creep from rest at the first sample.
     resting : ndarray of bool, shape (stretches,)
         Stretches that begin with all creep at rest.
     rested : bool
-        Whether that holds where a record begins as a simulation does.
+        Whether creep is at rest at the start of a record whose memory is known.
     starts, guesses : ndarray, shape (records, PARTS)
-        Shares m of the memory, and what they are drawn to; guesses of zero are known.
+        Shares m of the memory, and their first guesses in the prior; guesses of zero are known.
     """
 
     law: HysteresisLaw
@@ -113,7 +113,7 @@ class Stage:
         delay: int,
         guesses: Array,
     ) -> Stage:
-        """Return a stage whose H is a straight line with the gain of `dynamics`."""
+        """Make a stage whose H is a straight line with the gain of `dynamics`."""
         c = np.zeros(law.size)
         c[-1] = dynamics.gain
         none = np.empty(0)
@@ -132,17 +132,17 @@ class Stage:
         )
 
     def with_creep(self, taus: Array, stretches: Sequence[Stretch]) -> Stage:
-        """Return the stage with elements of creep that have no share yet."""
+        """Add elements of creep that have no share yet."""
         return replace(self, taus=taus, creep=np.zeros(taus.size)).on_other(stretches)
 
     def with_law(self, law: HysteresisLaw) -> Stage:
-        """Return the stage with a wider law of H on the same thresholds."""
+        """Replace the law of H by a wider law on the same thresholds."""
         c = np.zeros(law.size)
         c[self.law.within(law)] = self.coefficients
         return replace(self, law=law, coefficients=c)
 
     def on_other(self, stretches: Sequence[Stretch]) -> Stage:
-        """Return the stage for other stretches of the same records."""
+        """Move the stage to other stretches of the same records."""
         known = self._known & self.rested
         resting = [bool(known[s.record]) and not s.before.size for s in stretches]
         lags = np.zeros((len(stretches), self.taus.size))
@@ -150,7 +150,7 @@ class Stage:
 
     @property
     def _known(self) -> Mask:
-        """Records whose memory at the start is known, shape (records,)."""
+        """Mark of the records whose memory at the start is known, shape (records,)."""
         return np.logical_not(self.guesses.any(axis=1))
 
     @property
@@ -160,13 +160,13 @@ class Stage:
 
     @property
     def size(self) -> int:
-        """Number of parameters that are not zero and no start: what a comparison counts."""
+        """Number of nonzero parameters of H, G and creep, which a comparison counts."""
         G = 0 if self.dynamics.is_static else self.dynamics.a.size + self.dynamics.b.size
         return int(np.count_nonzero(self.coefficients)) + G + int(np.count_nonzero(self.creep))
 
     @property
     def values(self) -> Array:
-        """All numbers of the fit, shape (p,)."""
+        """All parameters of the fit, shape (p,)."""
         G = self.dynamics
         return np.concatenate(
             [
@@ -181,10 +181,10 @@ class Stage:
 
     @functools.cached_property
     def _powers(self) -> Array:
-        """Map slopes to the powers v^2, v^3 and v, or v^3 and v; shape (3, 3) or (2, 2)."""
+        """Map from slopes to the powers v^2, v^3 and v, or v^3 and v; shape (3, 3) or (2, 2)."""
         low, high = self.law.span
         if self.law.name == 'plays':
-            # the slope is least or most at zero and where |v| is largest
+            # the slope is smallest or largest at zero and at the largest |v|
             widest = 3.0 * max(-low, high) ** 2
             return np.array([[-1.0 / widest, 1.0 / widest], [1.0, 0.0]])
         # slopes of v^2, v^3 and v as Bernstein coefficients over the span
@@ -193,7 +193,7 @@ class Stage:
         return np.asarray(np.linalg.inv([ends[0], middle, ends[1]]))
 
     def _sloped(self, c: Array) -> Array:
-        """Return coefficients of the law with slopes in the place of its powers."""
+        """Replace the powers among the coefficients of the law by slopes."""
         T = self._powers
         return np.concatenate([c[: -len(T)], np.linalg.solve(T, c[-len(T) :])])
 
@@ -202,7 +202,7 @@ class Stage:
         return np.concatenate([values[: -len(T)], T @ values[-len(T) :]])
 
     def _parts(self) -> list[slice]:
-        """Return the places of c, s, a and b, offsets, lags and starts among the values."""
+        """List the places of c, s, a and b, offsets, lags and starts among the values."""
         G = self.dynamics
         sizes = [
             self.law.size,
@@ -236,9 +236,9 @@ class Stage:
     @property
     def rising(self) -> tuple[Array, Array] | None:
         """
-        Rows, shape (k, p), and the least of each times a step, shape (k,), so that H rises.
+        Rows, shape (k, p), and the smallest product of each row and a step, for which H rises.
 
-        None without lags along the path, where bounds say so.
+        None without lags along the path, where `bounds` suffice.
         """
         if not self.law.lags:
             return None
@@ -252,9 +252,9 @@ class Stage:
     @property
     def prior(self) -> tuple[Array, Array]:
         """
-        What the values are drawn to, shape (p,), and the information of a prior, shape (p, p).
+        Centre of the prior, shape (p,), and its information, shape (p, p).
 
-        A prior of one observation of the size of its residual.
+        The prior counts like one observation with the rms residual of the fit.
         """
         h, creep, _, _, lags, starts = self._parts()
         middle, spread = np.zeros(starts.stop), np.full(starts.stop, np.inf)
@@ -269,9 +269,9 @@ class Stage:
 
     def moved(self, values: Array) -> Stage:
         """
-        Return the stage with other values.
+        Set other values.
 
-        ModelError where G is unstable, or its gain is none, or where H falls.
+        Raises ModelError if G is unstable, its gain is not positive, or H falls.
         """
         h, creep, poles, offsets, lags, starts = self._parts()
         lower, upper = self.bounds
@@ -282,7 +282,7 @@ class Stage:
             G = Dynamics(values[poles][:na], values[poles][na:])
             if not G.is_within(RADIUS) or not 0.0 < G.gain < np.inf:
                 raise ModelError('dynamics: unstable, or without a gain above zero')
-            # H holds the gain
+            # H takes the gain of G
             c, G = c * G.gain, G.normalised()
         if not self.law.hysteresis(c).lowest_slope() > 0.0:
             raise ModelError('hysteresis: H falls under a rising voltage')
@@ -297,7 +297,7 @@ class Stage:
         )
 
     def memory(self, stretch: Stretch) -> Array:
-        """Return the play outputs before the first sample of a stretch, shape (m,)."""
+        """Compute the play outputs before the first sample of a stretch, shape (m,)."""
         return self._memory(stretch, self.starts[stretch.record])
 
     def _memory(self, stretch: Stretch, shares: Array) -> Array:
@@ -308,20 +308,20 @@ class Stage:
         return play_columns(before, r, start)[:, -1]
 
     def signals(self, stretch: Stretch) -> tuple[Array, Array, Array]:
-        """Return h, the delayed w, and y without offset and lags; shapes (n,)."""
+        """Compute h, the delayed w, and y without offset and lags; shapes (n,)."""
         h = self.hysteresis(stretch.u, self.memory(stretch))
         w = delayed(self._crept(h, stretch), self.delay)
         return h, w, filter_arx(self.dynamics.a, self.dynamics.b, w)
 
     def added(self, stretch: Stretch) -> Array:
-        """Return offset and lags of a stretch, shape (n,)."""
+        """Compute offset and lags of a stretch, shape (n,)."""
         total = np.full(stretch.u.size, self.offsets[stretch.record])
         for share, tau, lag in self._unrest(stretch):
             total += share * lag * np.exp(-stretch.times / tau)
         return total
 
     def _unrest(self, stretch: Stretch) -> list[tuple[float, float, float]]:
-        """Return share, time constant and lag of each element of creep of a stretch."""
+        """List share, time constant and lag of each element of creep of a stretch."""
         if not self.taus.size:
             return []
         return list(zip(self.creep, self.taus, self.lags[stretch.number], strict=True))
@@ -331,14 +331,14 @@ class Stage:
         return h + sum(share * stretch.lagged(h, tau) for share, tau in seen) if seen else h
 
     def _behind(self, h: Array, stretch: Stretch) -> Array:
-        """Return what creep, delay and G make of a change of h."""
+        """Pass a change of h through creep, delay and G."""
         w = delayed(self._crept(h, stretch), self.delay)
         return filter_arx(self.dynamics.a, self.dynamics.b, w)
 
     def columns(
         self, stretch: Stretch, signals: tuple[Array, Array, Array]
     ) -> Iterator[Array | None]:
-        """Give the derivative of the prediction by each value, shape (n,); None for all zeros."""
+        """Yield the derivative of the prediction by each value, shape (n,); None if it is zero."""
         h, w, y = signals
         T, G = self._powers, self.dynamics
         powers = []
@@ -377,14 +377,14 @@ class Stage:
                 yield self._behind(change / step, stretch)
 
     def free(self, values: Array) -> Mask:
-        """Return which values are not on a bound, shape (p,)."""
+        """Mark the values that are not on a bound, shape (p,)."""
         lower, upper = self.bounds
         return np.asarray((values > lower + 1e-12) & (values < upper - 1e-12))
 
 
 def memory_of(u0: float, widest: float, shares: Array, thresholds: Array) -> Array:
     """
-    Return ``F_r(0) = u0 - int_0^r m(r') dr'`` of thresholds r, shape (m,).
+    Compute ``F_r(0) = u0 - int_0^r m(r') dr'`` of thresholds r, shape (m,).
 
     The shares m are constant on even parts between 0 and the widest threshold.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A uniformly sampled motion as a fit sees it."""
+"""Uniformly sampled motion for a fit."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from scipy.signal import lfilter
 @dataclass(frozen=True, eq=False)
 class Stretch:
     """
-    A motion, which samples count, and in which block each is.
+    Motion with a mask of the samples that count, and their blocks.
 
     Attributes
     ----------
     u, x : ndarray, shape (n,)
-        Normalised voltage and displacement.  All of the voltage is simulated.
+        Normalised voltage and displacement.  The simulation uses all of the voltage.
     use : ndarray of bool, shape (n,)
         Samples that count.
     block : ndarray of int, shape (n,)
         Number of the block of each sample; it never falls along a stretch.
     rate : float
-        [Hz]
+        Sampling rate [Hz].
     number : int
-        Place among all stretches.
+        Index among all stretches.
     record : int
-        Place of the record among all.
+        Index of the record among all records.
     before : ndarray, shape (k,)
-        What the plays remember of the record's voltage before the stretch; empty at its start.
+        Earlier voltages of the record that the plays remember; empty at the start of a record.
     """
 
     u: Array
@@ -50,18 +50,18 @@ class Stretch:
         return np.arange(self.u.size) / self.rate
 
     def lagged(self, h: Array, tau: float) -> Array:
-        """Return a signal behind 1 / (1 + tau p), from rest; tau in seconds, shape (n,)."""
+        """Filter a signal by 1 / (1 + tau p) from rest; tau in seconds, shape (n,)."""
         share = -np.expm1(-1.0 / (self.rate * tau))
         return np.asarray(h[0] + lfilter([share], [1.0, share - 1.0], h - h[0]))
 
     def with_use(self, use: Mask) -> Stretch:
-        """Return the same motion with other samples that count."""
+        """Replace the mask of samples that count."""
         return replace(self, use=use)
 
 
 def delayed(x: Array, samples: int) -> Array:
     """
-    Return a signal some samples later, preceded by its own first value; shape (n,).
+    Delay a signal that was constant before its first sample; shape (n,).
 
     Examples
     --------
@@ -75,10 +75,10 @@ def delayed(x: Array, samples: int) -> Array:
 
 def remembered(u: Array) -> Array:
     """
-    Return the first value of u, its turning points, and its last value, shape (k,).
+    Reduce u to its first value, the turning points that plays remember, and its last value.
 
-    Of four in a row the inner two are left out where they lie between the outer two: no play
-    remembers them (wiping out).
+    The result has shape (k,).  Of four values in a row, the inner two are dropped if they lie
+    between the outer two: plays do not remember them (wiping out).
 
     Examples
     --------
