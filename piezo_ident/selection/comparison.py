@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The comparison: which of several fits predicts best what it was not fitted to.
+Compare fits by their prediction of held-out data.
 
-The error of a candidate is the geometric mean of two mean squares: with interleaved blocks held
-out, and with whole kinds of motion held out.  Blocks alone would choose an H that follows what it
-has seen and errs elsewhere; kinds alone are few.  Of candidates that err alike the one with the
-fewest parameters is taken.
+The error of a candidate is the geometric mean of two mean squares.  One holds out interleaved
+blocks, the other whole kinds of motion.  Blocks alone would prefer an H that follows known motion
+and errs on other motion; kinds alone are too few.  The candidate with the fewest parameters wins
+if errors are alike.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ import numpy as np
 from piezo_ident.common.arrays import Integers
 from piezo_ident.fitting.free_run import Fit
 
-#: mean squares within this factor are alike, 5 % of an rms (taste)
+#: mean squares within this factor count as alike; it is 5 % of an rms (taste)
 ALIKE = 1.1
-#: share of the mean square that each effect may leave at most: it takes most of what is left
+#: an effect must lower the mean square to at most this share of its value without the effect
 EFFECT = 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """
-    A fit under a name, and what it leaves of data that were held out.
+    Fit with a name and its errors on held-out data.
 
     Attributes
     ----------
     name : str
     fit : Fit
     blocks, kinds : float
-        Mean squares, normalised; `kinds` is that of the blocks where no kinds can be held out.
+        Mean squares, normalised; `kinds` equals `blocks` if no kinds can be held out.
     effects : int
-        Effects beyond H, G and the delay.
+        Number of effects beyond H, G and the delay.
     """
 
     name: str
@@ -48,34 +48,34 @@ class Candidate:
 
     @property
     def error(self) -> float:
-        """Geometric mean of both mean squares."""
+        """Geometric mean of the two mean squares."""
         return float(np.sqrt(self.blocks * self.kinds))
 
     @property
     def price(self) -> float:
-        """The error, larger by what each effect must take."""
+        """Error divided by `EFFECT` for each effect, so that an effect must earn its place."""
         return float(self.error / EFFECT**self.effects)
 
 
 def candidate(
     name: str, fit: Fit, sets: Integers, kinds: Integers | None, effects: int = 0
 ) -> Candidate:
-    """Return a fit as a candidate; `sets` and `kinds` give the set of each block, -1 for none."""
+    """Rate a fit; `sets` and `kinds` give the set of each block, -1 for blocks without a set."""
     rows = fit.equations.rows
     blocks = float(fit.held_out(sets).sum() / rows.sum())
     if kinds is None:
         return Candidate(name, fit, blocks, blocks, effects)
     out = kinds >= 0
     left = fit.held_out(kinds)
-    # what is in no kind was fitted, and tells nothing
+    # blocks without a kind were fitted, so their errors do not count
     return Candidate(name, fit, blocks, float(left[out].sum() / rows[out].sum()), effects)
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate:
     """
-    Return the candidate of the least price; of those alike, the one with fewest parameters.
+    Choose the candidate with the lowest price; of alike prices, the fewest parameters.
 
-    Of as many parameters the lower price is taken.
+    The lower price decides between equal numbers of parameters.
     """
     least = min(c.price for c in candidates)
     alike = [c for c in candidates if c.price <= ALIKE * least]
@@ -83,7 +83,7 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
-    """Return what errs least of those with more effects than the chosen one, if it errs less."""
+    """Find the candidate of smallest error with more effects than `chosen`, if it errs less."""
     more = [c for c in candidates if c.effects > chosen.effects]
     best = min(more, key=lambda c: c.error, default=None)
     return best if best is not None and ALIKE * best.error < chosen.error else None

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Kinds of motion in a record without labels, from what the voltage does in each block.
+Find kinds of motion in a record without labels, from the voltage in each block.
 
-A block is described by the mean, the size and the speed of its voltage.  Blocks that are alike
-are one kind.  A kind at the edge of place, size or speed is never held out: a model that was
+A block is described by the mean, the size and the speed of its voltage.  Similar blocks form a
+kind.  A kind with the smallest or largest mean, size or speed is never held out: a model that was
 fitted without it would have to extrapolate.
 """
 
@@ -18,15 +18,15 @@ from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.fitting.stretch import Stretch
 from scipy.cluster.hierarchy import fcluster, linkage
 
-#: kinds that are looked for, and the fewest that can be held out in turn (taste)
+#: number of kinds, and smallest number of kinds that can be held out in turn (taste)
 KINDS, FEWEST = 6, 3
-#: least size and speed that are told apart, shares of the range and of the range per sample
+#: resolution of size and speed, as shares of the range and of the range per sample
 FAINT = 1e-4
 
 
 def interleaved(count: int, sets: int = 5) -> Integers:
     """
-    Return the set of each block; neighbours are in different sets, shape (count,).
+    Assign each block to a set; neighbours are in different sets, shape (count,).
 
     Examples
     --------
@@ -38,9 +38,9 @@ def interleaved(count: int, sets: int = 5) -> Integers:
 
 def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
     """
-    Return the kind of motion of each of `count` blocks, -1 for those that are not held out.
+    Find the kind of motion of each of `count` blocks; -1 for blocks that are not held out.
 
-    None where fewer than `FEWEST` kinds can be held out.
+    None if fewer than `FEWEST` kinds can be held out.
     """
     described = np.full((count, 3), np.nan)
     for s in stretches:
@@ -54,9 +54,10 @@ def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
 
 def kinds_of(described: Array) -> Integers | None:
     """
-    Return the kind of each block by its description, shape (blocks,), -1 for none.
+    Group blocks by their description; the kinds have shape (blocks,), with -1 for no kind.
 
-    The description has shape (blocks, k), nan of a block without one.  None as of `motion_kinds`.
+    The description has shape (blocks, k), with NaN for a block without description.  None as in
+    `motion_kinds`.
     """
     known = np.flatnonzero(np.isfinite(described).all(axis=1))
     if known.size < 2 * KINDS:
@@ -74,16 +75,16 @@ def kinds_of(described: Array) -> Integers | None:
 
 
 def description(u: Array) -> Array:
-    """Return the mean, and logarithms of the size and the speed, of a voltage; shape (3,)."""
+    """Compute the mean, and logarithms of the size and the speed, of a voltage; shape (3,)."""
     speed = float(np.sqrt(np.mean(np.diff(u) ** 2))) if u.size > 1 else 0.0
     return np.array([u.mean(), np.log(float(u.std()) + FAINT), np.log(speed + FAINT)])
 
 
 def _is_edge(x: Array, own: Mask) -> bool:
-    """Return whether a kind holds the least or the largest of any property."""
+    """Tell whether a kind has the smallest or the largest value of any property."""
     mean = x[own].mean(axis=0)
     rest = x[~own]
     if not rest.size:
-        # all blocks move alike
+        # all blocks belong to one kind
         return True
     return bool(np.any(mean < rest.min(axis=0)) or np.any(mean > rest.max(axis=0)))
