@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A model as an FMU: the C header as a co-simulation of FMI 3.0, in source.
+Export a model as an FMU: the C header as a co-simulation of FMI 3.0, in source.
 
-FMI, the Functional Mock-up Interface, is a standard of the Modelica Association; its headers are
-those of the program that compiles the FMU, for example FMPy.
+FMI, the Functional Mock-up Interface, is a standard of the Modelica Association.  The program that
+compiles the FMU, for example FMPy, supplies the headers of FMI.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
     """
     Write a model as an FMU in source: FMI 3.0, co-simulation.
 
-    Its input is ``voltage`` [V], and ``x_<name>`` for each further channel; its output is
-    ``displacement`` [m].  A file that exists is replaced.
+    The inputs are ``voltage`` [V], and ``x_<name>`` for each further channel.  The output is
+    ``displacement`` [m].  An existing file is replaced.
 
     Parameters
     ----------
@@ -38,11 +38,11 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
     Raises
     ------
     ConfigError
-        When the name is none in C.
+        If the name is not an identifier in C.
     ModelError
-        When an effect of the model is not written in C.
+        If an effect of the model has no C code.
     DataError
-        When the file cannot be written.
+        If the file cannot be written.
 
     Examples
     --------
@@ -56,7 +56,7 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
         'P': name.upper(),
         'title': name,
         'version': __version__,
-        # another model is another FMU
+        # the token identifies the model, so another model is another FMU
         'token': f'{{{uuid.uuid5(uuid.NAMESPACE_OID, header)}}}',
         'period': repr(1.0 / model.sample_rate),
         'rest': c_number(model.scaling.range[0]).strip('()'),
@@ -73,5 +73,5 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
         ZipFile(target, 'w') as archive,
     ):
         for file, text in files.items():
-            # without the time of writing the same model gives the same file
+            # no time stamp, so that the same model gives the same file
             archive.writestr(ZipInfo(file), text, ZIP_DEFLATED)

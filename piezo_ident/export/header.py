@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A model as a C header: prediction and feed-forward, sample by sample.
+Export a model as a C header: prediction and feed-forward, sample by sample.
 
-Each operator is written in C beside its loop (`piezo_ident.operators.c_code.CCode`); a header is
-these texts in the order of the chain.  The feed-forward has no equations of its own: what stands
-in front of G is a function of the next voltage alone once its memory is given, and its inverse is
-the root of that very function; G and its delay are undone by `piezo_ident.control.linear_inverse`.
+Each operator has its C code beside its Python loop (`piezo_ident.operators.c_code.CCode`).  A
+header joins this code in the order of the chain.  The feed-forward has no equations of its own.
+Given its memory, the output of all operators in front of G is a function of the next voltage.  The
+feed-forward solves this function for the voltage.  `piezo_ident.control.linear_inverse` inverts G
+and its delay.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, LinkGroup, links_of
 from piezo_ident.model.stage_model import StageModel
 
-#: [spans] beyond which no displacement is looked for
+#: largest displacement that the inverse looks for [spans]
 FAR = 100.0
-#: width of a line of numbers or words
+#: width of a line of numbers or words [characters]
 WIDTH = 88
 
 
 @dataclass(frozen=True, eq=False)
 class _FeedForward:
-    """What the template of the feed-forward needs."""
+    """Values that fill the template of the feed-forward."""
 
     taps: Array
     ahead: int
@@ -75,19 +76,19 @@ def export_c(
     feedforward: bool = True,
 ) -> str:
     """
-    Return a model as a C header: prediction and feed-forward, sample by sample.
+    Export a model as a C header: prediction and feed-forward, sample by sample.
 
     Parameters
     ----------
     model : StageModel
     name : str, optional
-        With which all names in the header begin.
+        Prefix of all names in the header.
     limits : tuple of float, optional
-        Lowest and highest voltage of the feed-forward [V]; the identified range when absent.
+        Lowest and highest voltage of the feed-forward [V]; by default the identified range.
     slew : float, optional
-        Largest speed of its voltage [V/s].
+        Largest speed of the voltage of the feed-forward [V/s].
     preview : int, optional
-        Samples that its motion is known ahead, at most; as many as are of use when absent.
+        Largest number of future samples of the motion; by default all that are useful.
     title : str, optional
         First line of the header.
     feedforward : bool, optional
@@ -96,17 +97,17 @@ def export_c(
     Returns
     -------
     str
-        C99 without dependencies; a comment at its head says how to call it, and what the
-        feed-forward does not make up for.
+        C99 without dependencies.  A comment at its head says how to call it, and which errors
+        the feed-forward leaves.
 
     Raises
     ------
     DataError
-        When it is given no model, or limits or slew are impossible.
+        If the model is not a `StageModel`, or limits or slew are impossible.
     ConfigError
-        When the name is none in C.
+        If the name is not an identifier in C.
     ModelError
-        When an effect of the model is not written in C, or the preview is shorter than its delay.
+        If an effect of the model has no C code, or the preview is shorter than the delay.
 
     Examples
     --------
@@ -174,12 +175,12 @@ def _feedforward(
     kept: tuple[float, float, float],
     preview: int | None,
 ) -> _FeedForward:
-    """Return what inverts a model; ModelError when it has no inverse."""
+    """Invert a model for the template; raises ModelError if it has no inverse."""
     model, lines = with_rising_hysteresis(model)
     front, _, back = links_of(model)
     part = 'front'
     if lines:
-        # beside that of the prediction
+        # the changed links are functions beside those of the prediction
         part = 'rising'
         front = LinkGroup([replace(link, tag=f'{part}_{link.tag}') for link in front.links])
     in_front = [link.name for link in front.links]
@@ -187,12 +188,12 @@ def _feedforward(
     Q = whole = linear_inverse(replace(model, effects=rest))
     if preview is not None:
         Q = Q.shortened(preview)
-    # an effect that passes the command on does so before it is known
+    # an effect that reads the command passes it on before it is known
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
     inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept
     for link in front.links:
-        # beyond them a change of the voltage changes nothing
+        # a larger change of the voltage would have no effect
         if link.name == 'slew_limit' and link.effect:
             most = min(most, link.effect.number('limit') * model.scaling.V)
         if link.name == 'saturation' and link.effect and link.effect.number('knee') == 0.0:
@@ -223,26 +224,26 @@ def _says(
     Q: LinearInverse,
     ahead: int,
 ) -> list[str]:
-    """Return what a feed-forward does, and what it does not make up for."""
+    """Describe a feed-forward and the errors that it leaves."""
     behind = ''
     if inverted.links:
-        behind = f' What stands behind it ({_named(inverted.links)}) is inverted likewise.'
+        behind = f' The part behind it ({_named(inverted.links)}) is inverted likewise.'
     text = (
-        'The voltage stays within LOWEST .. HIGHEST and changes by at most STEP from sample to '
-        'sample, whatever is wanted; a y that is no finite number is the last one again. '
-        'f.clipped counts the samples at which these limits kept the voltage from what was '
-        f'wanted. What stands in front of G ({_named(front.links)}) is inverted sample by sample, '
+        'The voltage always stays within LOWEST .. HIGHEST and changes by at most STEP from '
+        'sample to sample. A y that is not finite is replaced by the last y. f.clipped counts '
+        'the samples at which these limits changed the voltage. '
+        f'The part in front of G ({_named(front.links)}) is inverted sample by sample, '
         f'with its memory.{behind} G and its delay are undone by a filter of {Q.taps.size} '
         f'samples, {Q.ahead} of them ahead.  The feed-forward does not make up for'
     )
     lacks = [
-        'what the model does not know: noise, and its own error',
-        f'motion at which the gain of G is below {least_gain(model):.0%} of the static one: there '
-        'the voltage is kept small',
+        'errors of the model, and noise',
+        f'motion at which the gain of G is below {least_gain(model):.0%} of the static gain: '
+        'there the voltage is kept small',
         *(f'narrow plays: {line}' for line in lines),
     ]
     if Q.ahead < ahead:
-        lacks.append(f'what the filter would take from samples {Q.ahead + 1} to {ahead} ahead')
+        lacks.append(f'samples {Q.ahead + 1} to {ahead} ahead, which the filter would also need')
     for link in back.links:
         if 'v' in link.given(link.code.step):
             lacks.append(f'{link.name}: the voltage in the reading')
@@ -259,19 +260,19 @@ def _named(links: Sequence[Link]) -> str:
 
 
 def plain_text(text: str) -> str:
-    """Return a text from a file without what would end a comment in C, or not stand in XML."""
+    """Remove characters that would end a comment in C, or are not allowed in XML."""
     return ''.join(x for x in text if x.isprintable() and x != '*')
 
 
 def c_number(x: float) -> str:
-    """Return a number as it is written in C."""
+    """Write a number in C."""
     if math.isinf(x):
         return 'HUGE_VAL' if x > 0.0 else '(-HUGE_VAL)'
     return repr(float(x)) if x >= 0.0 else f'({float(x)!r})'
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a template of this room with its values filled in."""
+    """Fill the values into a template of this room."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('piezo_ident.export', 'templates'),
         autoescape=False,

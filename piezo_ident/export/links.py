@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The operators of a model as functions in C, and parts of its chain as calls of them."""
+"""Write the operators of a model as C functions, and parts of its chain as calls of them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from piezo_ident.operators.chain import Operator
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 
-#: what the statements of a link may be given
+#: signals that the statements of a link may read
 _GIVEN = ('u', 'v', 't', 'c')
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
     """
-    An operator of the chain in C.
+    Operator of the chain in C.
 
-    Its `tag` is unique within the model: that of the member with its state, and of its functions.
+    The `tag` is unique within the model.  It names the member with the state of the link, and the
+    functions of the link.
     """
 
     name: str
@@ -37,22 +38,22 @@ class Link:
 
     @property
     def members(self) -> list[str]:
-        """The members of the struct with its state."""
+        """Members of the struct with its state."""
         return self.code.state.split('\n')[:-1]
 
     def given(self, text: str) -> list[str]:
-        """Return which signals a text uses beside its own."""
+        """List the further signals that a text uses."""
         return [name for name in _GIVEN if name in _words(text)]
 
     def body(self, text: str) -> str:
-        """Return a text behind the numbers that it uses, without empty lines."""
+        """Put the numbers that a text uses in front of it, without empty lines."""
         used = _words(text)
         lines = [_constant(name, x) for name, x in self.code.numbers.items() if name in used]
         text = textwrap.dedent(text)
         return '\n'.join([*lines, *(line for line in text.split('\n') if line.strip())])
 
     def call(self, prefix: str, what: str, state: str) -> str:
-        """Return the statement that puts `x` through the link."""
+        """Write the statement that passes `x` through the link."""
         text = getattr(self.code, what)
         if not text:
             return ''
@@ -63,17 +64,17 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class LinkGroup:
-    """Neighbouring links, of which those of the slot ``hysteresis`` share the signal into H."""
+    """Neighbouring links; the links of the slot ``hysteresis`` share the signal into H."""
 
     links: Sequence[Link]
 
     @property
     def channels(self) -> list[str]:
-        """Further channels that they need."""
+        """Further channels that the links need."""
         return list(dict.fromkeys(x.code.channel for x in self.links if x.code.channel))
 
     def statements(self, prefix: str, what: str, channels: Sequence[str]) -> Iterator[str]:
-        """Give the statements that put `x` through the part; its state is ``*s``."""
+        """Yield the statements that pass `x` through the group; its state is ``*s``."""
         for link in self.links:
             if self.is_wrapped and link.name == 'H':
                 yield 'u = x;'
@@ -85,15 +86,15 @@ class LinkGroup:
 
     @property
     def is_wrapped(self) -> bool:
-        """Whether an effect in it needs the signal into H."""
+        """Whether an effect of the group needs the signal into H."""
         return any('u' in _words(link.code.step) for link in self.links)
 
 
 def links_of(model: StageModel) -> tuple[LinkGroup, LinkGroup, LinkGroup]:
     """
-    Return the links in front of G, G with its delay, and those behind, in their order.
+    List the links in front of G, G with its delay, and the links behind, in their order.
 
-    An effect that is not written in C raises ModelError.
+    Raises ModelError if an effect has no C code.
     """
     front: list[Link] = []
     linear: list[Link] = []
@@ -116,7 +117,7 @@ def links_of(model: StageModel) -> tuple[LinkGroup, LinkGroup, LinkGroup]:
 
 
 def _unwrapped(operators: Iterable[Operator]) -> Iterator[Operator]:
-    """Give the operators, and H before the effects that wrap it."""
+    """Yield the operators, with H before the effects that wrap it."""
     for operator in operators:
         if isinstance(operator, Effect) and operator.slot == 'hysteresis':
             yield from _unwrapped([operator.inner])
@@ -124,12 +125,12 @@ def _unwrapped(operators: Iterable[Operator]) -> Iterator[Operator]:
 
 
 def _words(text: str) -> set[str]:
-    # not the members of the state
+    # members of the state do not count
     return set(re.findall(r'(?<![>.\w])[A-Za-z_]\w*', text))
 
 
 def _constant(name: str, value: object) -> str:
-    """Return the definition of a number or of a list of numbers."""
+    """Write the definition of a number or of a list of numbers."""
     if isinstance(value, int):
         return f'enum {{ {name} = {value} }};'
     if not isinstance(value, np.ndarray):
