@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The catalogue of effects: those of the package, and a lab's own.
+Catalogue of effects, from the package and from plug-ins.
 
-An effect is what a stage does beyond H, G and z^-d.  `catalogue` holds all of them by name; a lab
-adds its own as an entry point in the group ``piezo_ident.effects``.
+An effect is a property of a stage beyond H, G and z^-d.  `catalogue` holds all effects by name.  A
+lab adds an effect as an entry point in the group ``piezo_ident.effects``.
 
     >>> from piezo_ident import effects
     >>> effects.find_effect('slew_limit').slot
@@ -68,10 +68,10 @@ _OWN: tuple[type[Effect], ...] = (
 @cache
 def catalogue() -> Mapping[str, type[Effect]]:
     """
-    Return every known effect by name.
+    Collect every known effect by name.
 
-    A plug-in that cannot be imported, is no `Effect`, or takes a name that is already there is
-    skipped with a warning.
+    A plug-in is skipped with a warning if it cannot be imported, is not an `Effect`, or takes an
+    existing name.
 
     Examples
     --------
@@ -99,12 +99,12 @@ def catalogue() -> Mapping[str, type[Effect]]:
 
 def find_effect(name: str) -> type[Effect]:
     """
-    Return the class of an effect.
+    Find the class of an effect by its name.
 
     Raises
     ------
     ModelError
-        When the name is not in the catalogue.
+        If the name is not in the catalogue.
 
     Examples
     --------

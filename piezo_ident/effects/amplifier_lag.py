@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Amplifier lag: the voltage on the piezo follows the command with a delay of its own."""
+"""Amplifier lag: the voltage on the piezo lags behind the command."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class AmplifierLag(Effect):
     """
     First-order lag of the amplifier, in front of H.
 
-    ``va(k) = a va(k-1) + (1 - a) v(k)`` with ``a = exp(-1 / (f_s tau))``: output resistance of the
-    amplifier times the capacitance of the piezo, tau = R C.  G, which is identified with the lag
-    in place, takes in most of it; what is left over is that the loops of H follow the lagged
-    voltage.
+    ``va(k) = a va(k-1) + (1 - a) v(k)`` with ``a = exp(-1 / (f_s tau))``.  The time constant
+    tau = R C is the output resistance of the amplifier times the capacitance of the piezo.  G is
+    identified with the lag in place and contains most of it.  The rest is that the loops of H
+    follow the lagged voltage.
 
     Notes
     -----
@@ -60,25 +60,25 @@ class AmplifierLag(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return lags from about a sample to a millisecond: small ones are not to scale."""
+        """List lags from about a sample to a millisecond: small lags do not scale."""
         sample = 1.0 / view.sample_rate
         lags = ladder(0.7 * sample, max(1e-3, 10.0 * sample), 4)
         return tuple(cls.trial({}, steps={'time_constant': min(tau, 0.5)}) for tau in lags)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: the amplifier has caught up."""
+        """Come to rest, with the voltage at the command."""
         self._state = np.array([x0])
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block with its signal lagged."""
+        """Lag the signal of the block."""
         if self.pole == 0.0:
             return block
         x = np.ascontiguousarray(block.x)
         return block.with_signal(_follow(x, self.pole, self._state))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         if self.pole == 0.0:
             return CCode()
         return CCode(

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Backlash: a guide or a joint that gives way before it takes the motion along."""
+"""Backlash: a guide or a joint moves some way before it carries the stage."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def _play(x: Array, width: float, state: Array) -> Array:
 
 class Backlash(Effect):
     """
-    A play on the displacement.
+    Play on the displacement.
 
     ``y = x + g (P[x] - x)`` with the symmetric play ``P(k) = max(x(k) - rho, min(x(k) + rho,
-    P(k-1)))`` of half-width rho; g = 1 is pure backlash, a smaller g the share of the stage that
-    hangs behind it.  After each turn of the displacement, not of the voltage, a way of 2 rho is
-    lost.
+    P(k-1)))`` of half-width rho.  g = 1 is pure backlash; a smaller g is the share of the stage
+    behind the play.  After each turn of the displacement, not of the voltage, a distance of
+    2 rho is lost.
 
     Notes
     -----
@@ -54,7 +54,7 @@ class Backlash(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return widths from 0.2 % to 10 % of the range."""
+        """List widths from 0.2 % to 10 % of the range."""
         if view.span <= 0.0:
             return ()
         widths = ladder(0.002 * view.span, 0.1 * view.span, 6)
@@ -66,13 +66,13 @@ class Backlash(Effect):
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block with its motion lost in part."""
+        """Apply the lost motion to the block."""
         gain = self.number('gain')
         p = _play(np.ascontiguousarray(block.x), self.number('width'), self._state)
         return block.with_signal(p if gain == 1.0 else block.x + gain * (p - block.x))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         gain = self.number('gain')
         lost = 's->p' if gain == 1.0 else 'x + gain * (s->p - x)'
         return CCode(

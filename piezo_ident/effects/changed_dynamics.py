@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Changed dynamics: a resonance that was added, or has moved, since G was identified."""
+"""Changed dynamics: a resonance was added, or has moved, since G was identified."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from piezo_ident.operators.chain import Block
 
 class ChangedDynamics(Effect):
     """
-    Modes in parallel with what G makes, without a change of its static gain.
+    Modes in parallel with the output of G; the static gain does not change.
 
     ``y = x + sum_m g_m (M_m - 1) x + k_m R_m x`` with ``M = w^2 / D``, ``R = w s / D`` and
     ``D = s^2 + 2 zeta w s + w^2``, each by the bilinear transform, prewarped at its own frequency.
 
-    A resonance that moved from (w, zeta) to (w', zeta') is exactly of this form, with the new
-    frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: then
-    the old mode times the effect is the new one.  A mode that was added with a share g has k = 0.
-    So g stays below 1, and above -3 for a mode that did not move by more than a factor of two: a
-    larger one far above the band would be any lag.
+    A resonance that moved from (w, zeta) to (w', zeta') has exactly this form, with the new
+    frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: the
+    old mode times the effect is the new mode.  An added mode with a share g has k = 0.  g
+    therefore stays below 1, and above -3 if a mode moved by at most a factor of two.  A larger
+    value far above the band would imitate any lag.
 
     Notes
     -----
@@ -67,7 +67,7 @@ class ChangedDynamics(Effect):
     def section(
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
     ) -> Array | None:
-        """Return a mode, which its gains scale."""
+        """Compute the filter of a mode, which its gains scale."""
         if name not in ('gain', 'rate_gain'):
             return None
         f, zeta = (float(values[of][index]) for of in ('frequency', 'damping'))
@@ -76,7 +76,7 @@ class ChangedDynamics(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return the lowest modes of G, moved a little, and a few new ones about the band."""
+        """List the lowest modes of G, moved slightly, and a few new modes near the band."""
         top, band = 0.45 * view.sample_rate, max(view.max_frequency, 5.0 / view.duration)
         lowest = sorted(m for m in view.modes if m[0] < top and m[1] < 0.9)[:2]
         tried = [(min(c * f, top), z) for f, z in lowest for c in (0.9, 1.0, 1.1)]
@@ -84,7 +84,7 @@ class ChangedDynamics(Effect):
         tried += [(f, z) for f in new for z in (0.02, 0.1)]
         trials = []
         for f, z in tried:
-            # far below a mode M - 1 goes with the square of the frequency, and R with itself
+            # far below a mode, M - 1 grows with the square of the frequency, and R linearly
             far = max(1.0, f / band)
             steps = {'gain': min(0.5, 1e-3 * far**2), 'rate_gain': min(1.0, 1e-3 * far)}
             trials.append(cls.trial({'frequency': [f], 'damping': [z]}, steps=steps))
@@ -97,7 +97,7 @@ class ChangedDynamics(Effect):
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block with the modes added."""
+        """Add the modes to the block."""
         if self._silent:
             return block
         y = block.x.copy()
@@ -106,7 +106,7 @@ class ChangedDynamics(Effect):
         return block.with_signal(y)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         if self._silent:
             return CCode()
         return sections_in_c(self._sections, 'x')

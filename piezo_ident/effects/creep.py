@@ -17,18 +17,18 @@ from piezo_ident.effects.trials import ladder
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-#: time after a step up to which motion may be that of dynamics [s]
+#: time after a step up to which motion may belong to the dynamics [s]
 AT_ONCE = 0.05
-#: share of what creeps on after a step that may come back
+#: largest share of the later creep after a step that may run backwards
 BACK = 0.5
-#: rms size of a share, known before: neighbouring elements hardly differ, and make up for one
-#: another in data of a few seconds, and nowhere else
+#: prior rms of a share: neighbouring elements hardly differ, so without the prior large shares of
+#: opposite sign would cancel each other in data of a few seconds, but not in other data
 SPREAD = 0.02
 
 
 @kernel
 def _crept(h: Array, c: Array, share: Array, state: Array) -> Array:
-    # share: 1 - a_i; written as a difference, so that an element that has caught up rests
+    # share: 1 - a_i; the update is a difference, so that an element at its input rests exactly
     out = np.empty(h.size)
     for k in range(h.size):
         x = h[k]
@@ -44,12 +44,12 @@ def _crept(h: Array, c: Array, share: Array, state: Array) -> Array:
 
 class Creep(Effect):
     """
-    Linear creep as a sum of slow first-order elements behind H.
+    Linear creep: a sum of slow first-order elements behind H.
 
     Each element follows ``x_i(k) = a_i x_i(k-1) + (1 - a_i) h(k)`` with
     ``a_i = exp(-1 / (f_s tau_i))``, and the output is ``h + sum_i c_i x_i``.  Time constants
-    spread over decades imitate the logarithmic law of piezo ceramics: one element a decade with
-    ``c_i = gamma`` is a creep of gamma a decade.
+    that are spread over decades imitate the logarithmic law of piezo ceramics: one element a
+    decade with ``c_i = gamma`` creeps by gamma a decade.
 
     Notes
     -----
@@ -84,7 +84,7 @@ class Creep(Effect):
     )
 
     def prepare(self) -> None:
-        """Leave out elements without a share."""
+        """Drop elements without a share."""
         self._seen = np.flatnonzero(self.array('gain'))
         self._c = self.array('gain')[self._seen]
         times = self.array('time_constant')[self._seen]
@@ -93,9 +93,9 @@ class Creep(Effect):
 
     def start_from(self, beyond: Array) -> None:
         """
-        Set how far each element is beyond its rest when it is reset: shape (c,), empty at rest.
+        Set the distance of each element from its rest after a reset: shape (c,), empty at rest.
 
-        Another number than that of the elements raises ModelError.
+        Raises ModelError if the number of distances is not the number of elements.
         """
         if beyond.size not in (0, self.array('gain').size):
             raise ModelError(
@@ -108,7 +108,7 @@ class Creep(Effect):
     def section(
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
     ) -> Array | None:
-        """Return an element, which its share scales."""
+        """Compute the filter of an element, which its share scales."""
         if name != 'gain':
             return None
         share = -np.expm1(-1.0 / (sample_rate * float(values['time_constant'][index])))
@@ -116,22 +116,22 @@ class Creep(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return elements spread over all times that the data hold, many and few."""
-        # faster elements make up for dynamics, where those matter, and else for a gain of H
+        """List elements spread over all times of the data, in two densities."""
+        # faster elements imitate the dynamics if these matter, or else a gain of H
         shortest = max(5.0 / view.sample_rate, 0.01 if view.is_fast else AT_ONCE)
-        # a time far beyond what is judged would pass for a drift
+        # a time constant far beyond the judged data would imitate a drift
         longest = max(min(view.duration, view.judged), 10.0 * shortest)
-        # single times would fit a decade better and the next one worse
+        # a single time constant would fit one decade better and the next decade worse
         sets = [ladder(shortest, longest, 7), ladder(3 * shortest, longest / 3, 4)]
         return tuple(cls.trial({'time_constant': taus}) for taus in sets)
 
     @classmethod
     def is_plausible(cls, values: Mapping[str, Any]) -> bool:
         """
-        Return whether what follows a step goes on in the direction of the step.
+        Tell whether the creep after a step continues in the direction of the step.
 
-        Shares of neighbouring time constants trade with each other, so that single ones may be
-        below zero; the fastest make up for dynamics.
+        Shares of neighbouring time constants compensate each other, so a single share may be
+        negative; the fastest elements correct the dynamics.
         """
         gain, tau = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
         t = np.geomspace(min(AT_ONCE, tau.max()), tau.max(), 100)
@@ -139,19 +139,19 @@ class Creep(Effect):
         return bool(-steps[steps < 0.0].sum() <= BACK * steps[steps > 0.0].sum())
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest, where every element has caught up, or to where `start_from` says."""
+        """Come to rest, with every element at its input plus the distance of `start_from`."""
         self._state = x0 + self._beyond
         return float(x0 + self._c @ self._state)
 
     def process(self, block: Block) -> Block:
-        """Return the block with the crept part added."""
+        """Add the creep to the block."""
         if self._c.size == 0:
             return block
         x = np.ascontiguousarray(block.x)
         return block.with_signal(_crept(x, self._c, self._share, self._state))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         n = self._c.size
         if n == 0:
             return CCode()

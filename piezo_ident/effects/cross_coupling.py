@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cross-coupling: another axis moves this one a little."""
+"""Cross-coupling: another axis moves this axis slightly."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 from piezo_ident.record.channels import role_of
 
-#: corner below which nothing follows another axis but heat [Hz]
+#: lowest plausible corner: below it only heat follows another axis [Hz]
 SLOWEST = 0.5
 
 
 class CrossCoupling(Effect):
     """
-    Another axis's logged voltage, through a second-order low-pass, added to the displacement.
+    Voltage of another axis, through a second-order low-pass, added to the displacement.
 
     ``y = x + (g + g' d/dt) M(s) (c - c0)`` with ``M = w^2 / (s^2 + 2 zeta w s + w^2)`` by the
-    bilinear transform, prewarped at w, and the rate exact at low frequencies.  c is a further
-    channel of the record in its own unit, c0 its value that counts as none.  Before the first
-    sample the channel is taken to have rested at it.
+    bilinear transform, prewarped at w; the rate is exact at low frequencies.  c is a further
+    channel of the record in its own unit, and c0 its value without effect.  The channel counts
+    as constant before the first sample.
 
     Notes
     -----
@@ -63,8 +63,8 @@ class CrossCoupling(Effect):
     def prepare(self) -> None:
         """Build the filter of the channel."""
         frequency, gain = self.number('frequency'), self.number('gain')
-        # g M + g' s M = g + g (M - 1) + g' (s/S) R; s/S as it is at low frequencies, where the
-        # rate is that of the channel whatever the prewarping
+        # g M + g' s M = g + g (M - 1) + g' (s/S) R; s/S is taken at low frequencies, where the
+        # rate then is the rate of the channel for any prewarping
         slope = 2.0 * self.sample_rate / slope_of_mode(frequency, self.sample_rate)
         rate = self.number('rate_gain') * slope
         self._section = SecondOrderSection(
@@ -75,10 +75,10 @@ class CrossCoupling(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return every channel that moves, with three corners."""
+        """List every channel that moves, with three corners."""
         trials = []
         for name, (rest, std) in view.channels.items():
-            # another axis's displacement is an answer too, and no cause of what both share
+            # the displacement of another axis is an answer, too, not a cause of shared motion
             if role_of(name) == 'y' or not (np.isfinite(std) and std > 0):
                 continue
             for f in (10.0, 100.0, 1000.0):
@@ -91,19 +91,19 @@ class CrossCoupling(Effect):
 
     @classmethod
     def is_plausible(cls, values: Mapping[str, Any]) -> bool:
-        """Return whether the low-pass is one of mechanics: a slower one makes a drift."""
+        """Tell whether the low-pass is as fast as mechanics; a slower low-pass is a drift."""
         frequency, damping = float(values['frequency']), float(values['damping'])
-        # of two real poles the slower one
+        # of two real poles, the slower pole counts
         slow = 1.0 if damping <= 1.0 else damping - np.sqrt(damping**2 - 1.0)
         return bool(slow * frequency >= SLOWEST)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest; the channel's rest value is known with its first sample only."""
+        """Come to rest; the rest value of the channel is only known with its first sample."""
         self._started = False
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block with the share of the other axis; ModelError without its channel."""
+        """Add the share of the other axis; raises ModelError without its channel."""
         name = self.text('channel')
         if name not in block.channels:
             has = ', '.join(sorted(block.channels)) or 'none'
@@ -120,7 +120,7 @@ class CrossCoupling(Effect):
         return block.with_signal(block.x + (self._gain * c + self._section.process(c)))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         code = sections_in_c([self._section], 'z')
         return CCode(
             {**code.numbers, 'gain': self._gain, 'offset': self.number('offset')},

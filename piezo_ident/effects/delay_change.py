@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Delay change: the delay is another than when it was identified."""
+"""Delay change: the delay differs from the identified delay."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from piezo_ident.operators.chain import Block
 
 class DelayChange(Effect):
     """
-    A correction of the model's own delay, by samples or a fraction of one, either way.
+    Correction of the delay of the model, by whole samples or a fraction, in either direction.
 
-    ``y(k) = x(k - d - delta)``, between samples by linear interpolation.  A link of the chain that
-    takes its signal block by block cannot look ahead, so a shorter delay is not made by one: the
-    model lengthens or shortens its own delay line by delta (`StageModel.total_delay`), and refuses
-    one that would come out negative.  Alone, the operator passes its signal on.  What joins the
-    signal behind the delay line, such as hum, another axis or feed-through, keeps its own time.
+    ``y(k) = x(k - d - delta)``, with linear interpolation between samples.  An operator of the
+    chain receives its signal block by block and cannot look ahead, so it cannot shorten a delay.
+    The model therefore lengthens or shortens its own delay line by delta
+    (`StageModel.total_delay`), and refuses a negative delay.  The operator itself passes its
+    signal unchanged.  Signals that join behind the delay line, such as hum, another axis or
+    feed-through, keep their own time.
 
     Notes
     -----
-    A driver's buffer or a sensor's filter, switched since the delay was identified: one sample
-    at 20 kHz is 3.8 % of rms(y) at 120 Hz.  Linear interpolation as the first of the Lagrange
+    Possible cause: the buffer of a driver or the filter of a sensor was switched after the
+    identification.  One sample at 20 kHz is 3.8 % of rms(y) at 120 Hz.  Linear interpolation is
+    the first of the Lagrange
     fractional delays: T. I. Laakso, V. Valimaki, M. Karjalainen and U. K. Laine, "Splitting the
     unit delay", IEEE Signal Process. Mag. 13(1), 1996, pp. 30-60.
     """
@@ -44,19 +46,19 @@ class DelayChange(Effect):
 
     @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
-        """Return the change in samples."""
+        """Give the change of the delay [samples]."""
         return float(values['samples'])
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return a fraction of a sample, about 1e-3 of the span at the speeds seen."""
+        """List a fraction of a sample, about 1e-3 of the span at the speeds of the data."""
         step = min(0.5, max(0.01, 1e-3 * view.sample_rate / view.speed))
         return (cls.trial({}, steps={'samples': step}),)
 
     def process(self, block: Block) -> Block:
-        """Return the block as it is: the model's delay line does the work."""
+        """Pass the block unchanged: the delay line of the model applies the effect."""
         return block
 
     def c_code(self) -> CCode:
-        """Return nothing, as `process` does nothing."""
+        """Write no statements, as `process` does nothing."""
         return CCode()

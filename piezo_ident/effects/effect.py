@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The base of effects: operators with a name, a slot and parameters that can switch them off."""
+"""Base of effects: operators with a name, a slot and parameters that can switch them off."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 
 __all__ = ['NAN', 'Effect', 'Parameter', 'Trial', 'Value', 'View']
 
-#: neutral value of a parameter without one
+#: neutral value of a parameter that has none
 NAN = float('nan')
 
 Value = float | str | Array
@@ -30,37 +30,38 @@ Value = float | str | Array
 @dataclass(frozen=True)
 class Parameter:
     """
-    One parameter of an effect.
+    Parameter of an effect.
 
-    An amplitude scales the effect from nothing; other parameters shape it.
+    An amplitude scales the effect from zero; other parameters shape it.
 
     Attributes
     ----------
     name, unit, description : str
         Units are those of the normalised chain: 1 is the full input or output span.
     neutral : float
-        The value at which the effect does nothing; NaN for a parameter without one.
+        Value at which the effect does nothing; NaN if the parameter has no such value.
     lower, upper : float
-        Bounds of a number.
+        Bounds of the value.
     vector : bool
         Whether the value is a list of numbers.
     default : float or str, optional
-        Value when the parameter is left out; for a list, of each of its numbers.  The neutral
-        value for an amplitude; another parameter without a default is required.
+        Value if the parameter is left out; in a list, of each number.  An amplitude defaults to
+        its neutral value; another parameter without a default is required.
     kind : str
         ``number`` or ``text``.
     step : float
-        Of an amplitude: a value at which the effect is about 1e-3 of the span; else 0.
+        For an amplitude: value at which the effect is about 1e-3 of the span; else 0.
     scale : str
         How a fit moves the parameter: ``linear``, ``log`` (its logarithm) or ``fixed``.
     tries : tuple
-        Of a parameter that is no amplitude: values worth trying on any data; for a list, lists.
+        For a parameter that is not an amplitude: values worth trying on any data; for a list,
+        lists.
     first_stays : bool
-        Of a list that follows time: whether its first number stays in one record while H is free,
-        which can do the same.
+        For a list over time: whether its first number stays fixed in a fit of one record with a
+        free H, because H can do the same.
     spread : float
-        Of an amplitude: rms size that its numbers are known to have, as one more observation in a
-        fit.  It keeps those small that make up for one another.
+        For an amplitude: prior rms of its numbers, which counts as one more observation in a
+        fit.  It keeps numbers small that compensate each other.
     """
 
     name: str
@@ -84,25 +85,25 @@ class Parameter:
 
     @property
     def is_amplitude(self) -> bool:
-        """Whether the effect is proportional to it near its neutral value."""
+        """Whether the effect is proportional to this parameter near its neutral value."""
         return self.step > 0.0
 
     def neutral_like(self, value: Value) -> Value:
-        """Return the neutral value, as a list where the value is one."""
+        """Give the neutral value; as a list if the given value is a list."""
         return np.full(np.size(value), self.neutral) if self.vector else self.neutral
 
     def clip(self, value: Any) -> Any:
-        """Return a value, or a list of them, moved into the bounds."""
+        """Move a value, or a list of values, into the bounds."""
         return value if self.kind == 'text' else np.clip(value, self.lower, self.upper)
 
     def read(self, value: Any, where: str) -> Value:
         """
-        Return a value as a float, a vector or a text.
+        Convert a value to a float, a vector or a text.
 
         Raises
         ------
         ModelError
-            When it is none, or out of bounds; the message starts with `where`.
+            If the value has the wrong type or is out of bounds; the message starts with `where`.
         """
         if self.kind == 'text':
             if not isinstance(value, str) or not value:
@@ -125,53 +126,54 @@ class Parameter:
 
 class Effect:
     """
-    Base of every effect: an operator of the chain.
+    Base class of every effect: an operator of the chain.
 
     A subclass sets the class attributes, reads its parameters by `number`, `array` and `text`,
     and defines `reset` and `process`.  In the slot ``hysteresis`` it receives H as `inner` and
-    stands in its place.
+    replaces it in the chain.
 
     Attributes
     ----------
     name, slot : str
-        In verdicts and files, and its place in the chain.
+        Name in verdicts and files, and place in the chain.
     parameters : tuple of Parameter
     description, needs : str
-        A line for the catalogue, with the typical size, and the excitation that would show it.
+        Line for the catalogue with the typical size, and the excitation that would show it.
     time_driven : bool
-        Whether it depends on time alone and not on the command: then its amplitudes differ from
-        record to record.
+        Whether the effect depends on time alone and not on the command.  Its amplitudes then
+        differ from record to record.
     rate_independent : bool
-        Whether it follows the path of the command alone, however fast: then a wide enough H
-        imitates it.
+        Whether the effect depends only on the path of the command, not on its speed.  A wide
+        enough H can then imitate it.
     in_dynamics : bool
-        Whether it is linear: had it been there at the identification, G would hold it.
+        Whether the effect is linear, so that an identification with the effect puts it into G.
     change : str
-        What it makes of a small change of its signal: ``passed`` as it is, where the effect only
-        adds something of its own; ``filtered``, the same whatever the signal and whenever;
-        ``scaled``, its `slope` times it; ``curved``, the same as long as it is small; or ``bent``.
+        Response of the effect to a small change of its signal.  ``passed``: the change passes,
+        because the effect only adds a signal of its own.  ``filtered``: a filter that depends
+        neither on the signal nor on time.  ``scaled``: `slope` times the change, of any size.
+        ``curved``: `slope` times the change, if it is small.  ``bent``: any other response.
     of_hysteresis : str
-        How what it adds to H, in the slot ``hysteresis``, follows from the coefficients of H:
-        ``not``, ``linear`` or ``bent``.
+        Dependence of the part that the effect adds in the slot ``hysteresis`` on the coefficients
+        of H: ``not``, ``linear`` or ``bent`` (nonlinear).
     in_delay_line : bool
-        Whether it is not an operator but a change of the model's delay, by `added_delay`.
+        Whether the effect changes the delay of the model, by `added_delay`, instead of the signal.
 
     Parameters
     ----------
     sample_rate : float
-        [Hz]
+        Sampling rate [Hz].
     values : mapping of str to float, str or sequence of float
         One value for each parameter that has no default.
     hysteresis : Hysteresis, optional
         Parameters of H, for effects in its slot.
     inner : Operator, optional
-        The operator that an effect in the slot ``hysteresis`` wraps.
+        Operator that an effect in the slot ``hysteresis`` wraps.
 
     Raises
     ------
     ModelError
-        When a parameter is missing, unknown, out of bounds or of the wrong shape, or when
-        parameters contradict each other.
+        If a parameter is missing, unknown, out of bounds or of the wrong shape, or if parameters
+        contradict each other.
     """
 
     name: ClassVar[str]
@@ -200,11 +202,11 @@ class Effect:
         self.prepare()
 
     def prepare(self) -> None:
-        """Compute once what follows from the parameters alone."""
+        """Compute values that depend on the parameters alone."""
 
     @classmethod
     def check(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Return the values as floats, vectors and texts, defaults filled in."""
+        """Convert the values to floats, vectors and texts, and add the defaults."""
         where, known = f'effect {cls.name}', {p.name: p for p in cls.parameters}
         unknown = sorted(set(values) - set(known))
         missing = sorted(k for k, p in known.items() if k not in values and p.default is None)
@@ -223,7 +225,7 @@ class Effect:
 
     @classmethod
     def agree(cls, values: Mapping[str, Value]) -> None:
-        """Refuse values that contradict each other: lists must be of one length."""
+        """Refuse values that contradict each other: lists must have the same length."""
         lengths = {k: x.size for k, x in values.items() if isinstance(x, np.ndarray)}
         if len(set(lengths.values())) > 1:
             each = ', '.join(f'{name} has {n}' for name, n in lengths.items())
@@ -231,7 +233,7 @@ class Effect:
 
     @classmethod
     def neutral(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Return the values with all neutral ones, at which the effect does nothing."""
+        """Set every parameter with a neutral value to it; the effect then does nothing."""
         checked = cls.check(values)
         for p in cls.parameters:
             if not np.isnan(p.neutral):
@@ -240,45 +242,46 @@ class Effect:
 
     @classmethod
     def is_neutral(cls, values: Mapping[str, Any]) -> bool:
-        """Return whether the effect does nothing at these values."""
+        """Tell whether the effect does nothing at these values."""
         return cls.same(values, cls.neutral(values))
 
     @classmethod
     def same(cls, one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-        """Return whether two sets of values are equal."""
+        """Tell whether two sets of values are equal."""
         first, second = cls.check(one), cls.check(other)
         return all(np.array_equal(x, second[name]) for name, x in first.items())
 
     @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
         """
-        Return the values of a time-driven effect to expect in another record.
+        Give the expected values of a time-driven effect in another record.
 
-        By default the neutral ones, since one record says nothing about another.
+        By default they are the neutral values, since a record says nothing about another record.
         """
         return cls.neutral(values)
 
     @classmethod
     def is_plausible(cls, values: Mapping[str, Any]) -> bool:
         """
-        Return whether a stage can be so; the bounds of single parameters do not tell.
+        Tell whether a stage can have these values; the bounds of single parameters cannot.
 
-        By default True.  A diagnosis names no effect with values that are not.
+        By default True.  A diagnosis never names an effect with implausible values.
         """
         return True
 
     @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
-        """Return the delay [samples] that an effect `in_delay_line` adds."""
+        """Give the delay [samples] that an effect `in_delay_line` adds."""
         return 0.0
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """
-        Return the settings at which the effect is tried on given data.
+        List the settings at which the effect is tried on given data.
 
-        By default each combination of the `tries` of the parameters that are no amplitudes, with
-        all amplitudes moved; no trials when such a parameter has neither `tries` nor a default.
+        By default these are all combinations of the `tries` of the shape parameters (those that
+        are not amplitudes), with all amplitudes moved.  A shape parameter with neither `tries`
+        nor a default leaves no trials.
         """
         shapes = [p for p in cls.parameters if not p.is_amplitude]
         choices = [p.tries or (() if p.default is None else (p.default,)) for p in shapes]
@@ -293,16 +296,16 @@ class Effect:
         steps: Mapping[str, float] | None = None,
     ) -> Trial:
         """
-        Return one trial: amplitudes at their neutral values, the rest as given.
+        Make one trial: amplitudes at their neutral values, other parameters as given.
 
         Parameters
         ----------
         shape : mapping
-            Values of parameters that are no amplitudes; they are clipped to their bounds.
+            Values of parameters that are not amplitudes; they are clipped to their bounds.
         moved : sequence of str, optional
-            Amplitudes that are moved; all when absent.  Each element of a list moves by itself.
+            Amplitudes that are moved; by default all.  Each element of a list moves by itself.
         steps : mapping of str to float, optional
-            Steps that replace those of the parameters.
+            Steps that replace the steps of the parameters.
         """
         known = {p.name: p for p in cls.parameters}
         values = cls.check({name: known[name].clip(x) for name, x in shape.items()})
@@ -324,22 +327,23 @@ class Effect:
         cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
     ) -> Array | None:
         """
-        Return the filter of the signal that a number of a list scales and adds.
+        Compute the filter of the signal whose output a number of a list scales and adds.
 
-        That are b_0, b_1, b_2, a_1 and a_2, or None where it is no such number.
+        The filter is b_0, b_1, b_2, a_1 and a_2; None if the number does not scale a filter.
         """
         return None
 
     def slope(self, block: Block) -> Array:
-        """Return the slope of an effect that is ``scaled`` or ``curved``, shape (n,)."""
+        """Compute the slope of an effect that is ``scaled`` or ``curved``, shape (n,)."""
         return np.ones_like(block.x)
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """
-        Return the derivatives of what `process` would make of a block, by names of parameters.
+        Compute the derivatives of the output of `process` by parameters, by their names.
 
-        From the memory as it is, which stays; each of shape (n,).  For effects around H, and
-        parameters that are single numbers.  By default none: they are taken by differences.
+        The memory stays unchanged.  Each derivative has shape (n,).  The method serves effects
+        around H and parameters that are single numbers.  By default it gives no derivatives, and
+        they are taken by differences.
         """
         return {}
 
@@ -347,9 +351,10 @@ class Effect:
         self, block: Block, rest: float, parts: Iterable[tuple[Hysteresis, Array]]
     ) -> Iterator[Array]:
         """
-        Give what H would become if it were one part of it alone, for each; shapes (n,).
+        Yield the output of the slot ``hysteresis`` for each part of H alone; shapes (n,).
 
-        Each part, plays alone or without any, comes with the outputs of its plays at `rest`.
+        A part consists of plays only, or has no plays.  It comes with the outputs of its plays at
+        `rest`.
         """
         for h, memory in parts:
             operator = type(self)(self.sample_rate, self.values, h, HysteresisOperator(h, memory))
@@ -357,27 +362,27 @@ class Effect:
             yield operator.process(block).x
 
     def number(self, name: str) -> float:
-        """Return a scalar parameter."""
+        """Read a scalar parameter."""
         return float(self.values[name])
 
     def array(self, name: str) -> Array:
-        """Return a parameter as a vector."""
+        """Read a parameter as a vector."""
         return np.atleast_1d(np.asarray(self.values[name], dtype=np.float64))
 
     def text(self, name: str) -> str:
-        """Return a text parameter."""
+        """Read a text parameter."""
         return str(self.values[name])
 
     @property
     def core(self) -> Operator:
-        """The innermost operator of the slot ``hysteresis``: H, as a rule."""
+        """Innermost operator of the slot ``hysteresis``; normally H."""
         operator: Operator = self.inner
         while isinstance(operator, Effect):
             operator = operator.inner
         return operator
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest; what has no memory, and adds nothing at rest, passes its signal on."""
+        """Come to rest; by default the signal passes, without memory or an addition at rest."""
         return x0
 
     def process(self, block: Block) -> Block:
@@ -386,12 +391,12 @@ class Effect:
 
     def c_code(self) -> CCode:
         """
-        Return the effect in C, for `piezo_ident.export_c`.
+        Write the effect in C, for `piezo_ident.export_c`.
 
         Raises
         ------
         ModelError
-            Unless a subclass has it.
+            If the subclass does not define it.
         """
         raise ModelError(
             f'effect {self.name}: is not written in C and cannot be exported; give its class a '

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Even nonlinearity: the part of the static curve that H, odd in the voltage, cannot have."""
+"""Even nonlinearity: even part of the static curve, which the odd H cannot describe."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class EvenNonlinearity(Effect):
     Even powers of the voltage, added to H.
 
     ``w = H[v] + p0 v^2 + p4 v^4 + p6 v^6``.  The static part of H is ``p1 v^3 + p2 v``, odd
-    about v = 0; electrostriction, which goes with the square of the field, and the unequal
-    stiffness of a preloaded stack are not.
+    about v = 0.  Two causes are not odd: electrostriction, which grows with the square of the
+    field, and the unequal stiffness of a preloaded stack.
 
     Notes
     -----
@@ -42,7 +42,7 @@ class EvenNonlinearity(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return the square alone, with the fourth power, and all."""
+        """List the square alone, with the fourth power, and all three powers."""
         return cls.trial({}, ['square']), cls.trial({}, ['square', 'fourth']), cls.trial({})
 
     def reset(self, v0: float, x0: float) -> float:
@@ -50,12 +50,12 @@ class EvenNonlinearity(Effect):
         return self.inner.reset(v0, x0) + float(self._even(np.array([x0]))[0])
 
     def process(self, block: Block) -> Block:
-        """Return the block with H applied and the even powers added."""
+        """Apply H to the block and add the even powers."""
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + self._even(block.x))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         names = ('square', 'fourth', 'sixth')
         step = 'x += u * u * (square + u * u * (fourth + u * u * sixth));\n'
         return CCode({name: self.number(name) for name in names}, rest=step, step=step)

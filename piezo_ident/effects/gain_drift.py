@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Gain drift: the sensitivity of piezo or sensor wanders with temperature and age."""
+"""Gain drift: the sensitivity of piezo or sensor changes with temperature and age."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from piezo_ident.operators.chain import Block
 
 @ordered_kernel
 def _with_gain(x: Array, t: Array, at: Integers, knots: Array, gains: Array) -> Array:
-    # t ascends; at: the first sample of each knot; the gain between two is a straight line
+    # t ascends; at: first sample of each knot; the gain between two knots is a straight line
     out = x.copy()
     for i in range(-1, knots.size):
         start, stop = at[i] if i >= 0 else 0, at[i + 1] if i + 1 < at.size else x.size
         knot, gain, slope = knots[max(i, 0)], gains[max(i, 0)], 0.0
         if 0 <= i < knots.size - 1:
             slope = (gains[i + 1] - gain) / (knots[i + 1] - knot)
-        # slices, whose indices cannot be negative, let the loop run in vector lanes
+        # slices have no negative indices, which lets the compiler vectorise the loop
         now, before, after = t[start:stop], x[start:stop], out[start:stop]
         for k in range(now.size):
             after[k] = before[k] * (1.0 + (gain + slope * (now[k] - knot)))
@@ -35,11 +35,11 @@ def _with_gain(x: Array, t: Array, at: Integers, knots: Array, gains: Array) -> 
 
 class GainDrift(Effect):
     """
-    A gain that changes slowly with time.
+    Gain that changes slowly with time.
 
     ``y = x (1 + a(t))`` with a piecewise linear between knots and constant beyond them.  Time is
-    that of the sample clock.  The knots hold for one record: what the gain does in another record,
-    or beyond the last knot, does not follow from them.
+    the time of the sample clock.  The knots hold for one record.  The gain in another record, or
+    after the last knot, does not follow from them.
 
     Notes
     -----
@@ -83,9 +83,9 @@ class GainDrift(Effect):
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """
-        Return one to twelve stretches; the first knot stays, as a constant gain is H's.
+        List one to twelve stretches; the first knot stays fixed, as H holds a constant gain.
 
-        It is where the data begin to count: before, the gain could have been any.
+        The first knot lies at the first sample that counts: the gain before it is unknown.
         """
         trials = []
         last = view.duration if view.last is None else view.last
@@ -97,7 +97,7 @@ class GainDrift(Effect):
 
     @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Return the mean gain of the record: H was fitted to the gain before the first knot."""
+        """Give the mean gain of the record: H was fitted to the gain before the first knot."""
         checked = cls.check(values)
         time, gain = (np.asarray(checked[name], dtype=np.float64) for name in ('time', 'gain'))
         at = np.linspace(time[0], time[-1], 1000)
@@ -105,17 +105,17 @@ class GainDrift(Effect):
         return cls.check({'time': time[:1], 'gain': [mean]})
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: the gain as it is before the first knot."""
+        """Come to rest with the gain before the first knot."""
         return x0 * (1.0 + float(self.array('gain')[0]))
 
     def process(self, block: Block) -> Block:
-        """Return the block with the gain of each moment."""
+        """Multiply the block by the gain at each time."""
         if not self.array('gain').any():
             return block
         return block.with_signal(self._scaled(np.ascontiguousarray(block.x), block.t))
 
     def slope(self, block: Block) -> Array:
-        """Return one and the gain of each moment."""
+        """Compute one plus the gain at each time."""
         return self._scaled(np.ones(block.t.size), block.t)
 
     def _scaled(self, x: Array, t: Array) -> Array:
@@ -123,7 +123,7 @@ class GainDrift(Effect):
         return _with_gain(x, np.ascontiguousarray(t), np.searchsorted(t, time), time, gain)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         time, gain = self.array('time'), self.array('gain')
         if not gain.any():
             return CCode()

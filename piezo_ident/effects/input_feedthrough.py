@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Input feed-through: the drive leaks into the sensor's electronics."""
+"""Input feed-through: the drive leaks into the electronics of the sensor."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from piezo_ident.operators.chain import Block
 
 class InputFeedthrough(Effect):
     """
-    The command, and its rate, in the reading without any delay.
+    Command and its rate in the reading, without any delay.
 
-    ``y = x + k0 v + k1 dv/dt``, the rate as a backward difference: a resistive and a capacitive
-    path from the drive into the sensor's electronics.  It arrives before the displacement does,
-    at lags shorter than the delay.
+    ``y = x + k0 v + k1 dv/dt``, with the rate as a backward difference.  The terms are a resistive
+    and a capacitive path from the drive into the electronics of the sensor.  The feed-through
+    arrives before the displacement, at lags shorter than the delay.
 
     Notes
     -----
@@ -38,7 +38,7 @@ class InputFeedthrough(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return both paths together."""
+        """List both paths together."""
         return (cls.trial({}, steps={'rate_gain': min(0.1, 1e-3 / view.speed)}),)
 
     def reset(self, v0: float, x0: float) -> float:
@@ -47,7 +47,7 @@ class InputFeedthrough(Effect):
         return x0 + self.number('gain') * v0
 
     def process(self, block: Block) -> Block:
-        """Return the block with the command's share added."""
+        """Add the share of the command to the block."""
         if block.v.size == 0:
             return block
         k0, k1 = self.number('gain'), self.number('rate_gain') * self.sample_rate
@@ -59,7 +59,7 @@ class InputFeedthrough(Effect):
         return block.with_signal(y)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         return CCode(
             {
                 'gain': self.number('gain'),

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The compiled loops of plays whose thresholds grow with the speed.
+Compiled loops of plays whose thresholds grow with the speed.
 
-Their equations are those of
-`piezo_ident.effects.rate_dependent_hysteresis.RateDependentHysteresis`.  The thresholds r and
-weights q, shapes (m,), come with idle plays that fill the vector lanes; `power` is ``|s|^eps``,
-shape (n,), of the speed s.
+`piezo_ident.effects.rate_dependent_hysteresis.RateDependentHysteresis` has their equations.  The
+thresholds r and weights q, shapes (m,), include idle plays that fill the vector lanes.  `power` is
+``|s|^eps`` of the speed s, shape (n,).
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from piezo_ident.common.kernel import alive, kernel, ordered_kernel
 from piezo_ident.operators.kernels import curve, curve_slope, held
 from piezo_ident.operators.parts import four_sums
 
-#: growth of the lower edge, even and relative, and of the upper one
+#: growth of the lower edge, even and relative, and of the upper edge
 Growth = tuple[float, float, float, float]
 
 
 @ordered_kernel
 def _edges(x: float, r: float, power: float, growth: Growth) -> tuple[float, float]:
-    """Return the edges of the band of a play; where they cross, the lower one counts."""
+    """Compute the edges of the band of a play; if they cross, the lower edge counts."""
     gain, stretch, lead, lead_stretch = growth
     width = r * (1.0 + stretch * power) + gain * power
     low = x - (width if width > 0.0 else 0.0)
@@ -46,12 +45,13 @@ def growth_of_plays(
     out: Array,
 ) -> None:
     """
-    Write what growth adds to the sum of all plays into `out`, shape (n,), and carry both on.
+    Write the change of the sum of all plays by growth into `out`, shape (n,).
 
-    `memory` is that of the plays whose thresholds grow, `still` of the same with fixed ones;
-    `low_v` and c are as in `piezo_ident.operators.kernels.wide_hysteresis`.
+    `memory` belongs to the plays whose thresholds grow, `still` to the same plays with fixed
+    thresholds; both are updated.  `low_v` and c are as in
+    `piezo_ident.operators.kernels.wide_hysteresis`.
     """
-    # loops of few arrays each run in vector lanes
+    # separate loops over few arrays vectorise
     n_r = r.size
     for k in range(v.size):
         x, p = v[k], power[k]
@@ -72,7 +72,7 @@ def growth_of_plays(
 
 @ordered_kernel
 def moved_play(v: Array, r: float, power: Array, growth: Growth, f: float, out: Array) -> None:
-    """Write a play whose threshold grows into `out`, shape (n,), from its output f before."""
+    """Write a play whose threshold grows into `out`, shape (n,); f is its output before."""
     for k in range(v.size):
         low, high = _edges(v[k], r, power[k], growth)
         f = held(f, low, high)
@@ -114,13 +114,14 @@ def growth_slopes(
     out: Array,
 ) -> None:
     """
-    Write the derivatives of what `growth_of_plays` does into `out`, shape (7, n).
+    Write the derivatives of the output of `growth_of_plays` into `out`, shape (7, n).
 
-    By gain, stretch, lead and lead_stretch, and by three numbers that shape the power: `bends`,
-    shape (3, n), are the derivatives of the power by these.
+    Rows 0 to 3 are the derivatives by gain, stretch, lead and lead_stretch.  Rows 4 to 6 are the
+    derivatives by the three parameters that shape the power; `bends`, shape (3, n), holds the
+    derivatives of the power by these parameters.
     """
-    # the three are written out, so that the loops over plays run in vector lanes
-    # a play that moves goes with the edge that moves it; one that rests keeps what it was moved by
+    # the three sums are written out, so that the loops over plays vectorise; a play that moves has
+    # the derivative of the edge that moves it, and a play that rests keeps its last derivative
     n_r, (gain, stretch, lead, lead_stretch) = r.size, growth
     by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
     one, two, three = np.zeros(n_r), np.zeros(n_r), np.zeros(n_r)
@@ -161,7 +162,7 @@ def growth_slopes(
 
 @kernel
 def speed_of(v: Array, pole: float, rate: float, state: Array) -> Array:
-    """Return the speed of v behind a low-pass; `state`, last input and speed, is carried on."""
+    """Compute the speed of v behind a low-pass; updates `state`, the last input and speed."""
     speed = np.empty(v.size)
     last, s = state[0], state[1]
     for k in range(v.size):

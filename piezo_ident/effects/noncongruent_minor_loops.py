@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noncongruent minor loops: loops of one width differ with the bias at which they are drawn."""
+"""Noncongruent minor loops: loops of the same width differ with their bias."""
 
 from __future__ import annotations
 
@@ -39,16 +39,17 @@ class NoncongruentMinorLoops(Effect):
     """
     Plays whose weight depends on the voltage.
 
-    ``w = H[v] + sum_j (kappa_j (v - c) F_rho_j[v] + lambda_j F_rho_j[v]^2)``: the weight may go
-    with the voltage, or with where the play stands.  In a Prandtl-Ishlinskii operator all minor
-    loops between the same two voltages are congruent, and so are, but for the cubic, those of one
-    width at different biases; a weight that grows with the voltage takes that away.  The plays
-    have thresholds and a memory of their own.
+    ``w = H[v] + sum_j (kappa_j (v - c) F_rho_j[v] + lambda_j F_rho_j[v]^2)``.  The weight grows
+    with the voltage (kappa) or with the output of the play (lambda).  In a Prandtl-Ishlinskii
+    operator all minor loops between the same two voltages are congruent.  Without its cubic, all
+    loops of the same width at different biases are congruent, too.  A weight that grows with the
+    voltage breaks this.  The plays have thresholds and a memory of their own.
 
-    After `reset` each play is where H would have one of its threshold: at the state of a stage
-    that last came down to zero (`Hysteresis.initial_memory`), unless H was given another memory.
-    Then the play takes what lies between those of H, whose outputs are a continuous function of
-    the threshold that starts at F_0 = v and is flat beyond the largest.
+    After `reset` each play has the output of a play of H with the same threshold.  By default
+    this is the state of a stage that last came down to zero (`Hysteresis.initial_memory`).  If H
+    was given another memory, the output is interpolated between the plays of H.  Their outputs
+    are a continuous function of the threshold, which starts at F_0 = v and is flat beyond the
+    largest threshold.
 
     Notes
     -----
@@ -74,7 +75,7 @@ class NoncongruentMinorLoops(Effect):
     )
 
     def prepare(self) -> None:
-        """Unpack the lists."""
+        """Read the lists."""
         self._r = self.array('threshold')
         self._slope, self._bend = self.array('slope'), self.array('bend')
 
@@ -87,7 +88,7 @@ class NoncongruentMinorLoops(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return narrow, middling and wide plays that go with v or with themselves, and one."""
+        """List plays of three widths with either kind of weight, and a single play."""
         bias = (view.low + view.high) / 2
         widths = np.array([0.05, 0.15, 0.4]) * view.span
         shape = {'threshold': widths, 'bias': bias}
@@ -99,7 +100,7 @@ class NoncongruentMinorLoops(Effect):
         )
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest, with the plays where H would have them."""
+        """Come to rest, with plays as H would have them."""
         w = self.inner.reset(v0, x0)
         memory, core = initial_memory(x0, self._r), self.core
         if isinstance(core, HysteresisOperator):
@@ -112,13 +113,13 @@ class NoncongruentMinorLoops(Effect):
         return w + float(self._more(np.array([x0]))[0])
 
     def process(self, block: Block) -> Block:
-        """Return the block with H applied and the plays added."""
+        """Apply H to the block and add the plays."""
         more = self._more(np.ascontiguousarray(block.x))
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         n = self._r.size
         more = """
         double w = 0.0, bent = 0.0;

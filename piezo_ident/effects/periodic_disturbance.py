@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Hum: lines in the displacement that have nothing to do with the command."""
+"""Hum: lines in the displacement that do not depend on the command."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class PeriodicDisturbance(Effect):
     """
     Mains hum or a machine nearby: a sum of sines added to the displacement.
 
-    ``d(t) = sum_i A_i sin(2 pi m_i f t + phi_i)`` with a base frequency f and the harmonics m_i
-    that are wanted.  Time is that of the sample clock, so the phase holds across the pieces
-    of a record but is another in each record.
+    ``d(t) = sum_i A_i sin(2 pi m_i f t + phi_i)`` with a base frequency f and chosen harmonics
+    m_i.  Time is the time of the sample clock, so the phase is the same in all pieces of a record
+    but differs from record to record.
 
     Notes
     -----
@@ -32,7 +32,7 @@ class PeriodicDisturbance(Effect):
     needs = 'a rest of 2 s, or motion at frequencies other than its lines'
     time_driven = True
     parameters = (
-        # found as a line, far more sharply than a fit of neighbouring columns could move it
+        # a spectral line gives the frequency far more sharply than a fit could
         Parameter('frequency', 'Hz', 'base frequency f', NAN, 1e-3, 1e6, scale='fixed'),
         Parameter('harmonic', '1', 'multiple m_i of f', NAN, 1.0, 1e3, True, scale='fixed'),
         Parameter('amplitude', '1', 'amplitude A_i of each', 0.0, -1.0, 1.0, True, step=1e-3),
@@ -43,7 +43,7 @@ class PeriodicDisturbance(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return one trial a line, with up to three harmonics as sine and cosine."""
+        """List one trial for each line, with up to three harmonics as sine and cosine."""
         trials = []
         for f in view.lines:
             harmonics = [m for m in (1.0, 2.0, 3.0) if m * f < view.nyquist]
@@ -57,7 +57,7 @@ class PeriodicDisturbance(Effect):
         return tuple(trials)
 
     def process(self, block: Block) -> Block:
-        """Return the block with the lines added."""
+        """Add the lines to the block."""
         y = block.x.copy()
         turn = 2 * np.pi * self.number('frequency')
         lines = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
@@ -67,7 +67,7 @@ class PeriodicDisturbance(Effect):
         return block.with_signal(y)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         turn = 2 * np.pi * self.number('frequency')
         m, amplitude, phase = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
         return CCode(

@@ -13,11 +13,11 @@ from piezo_ident.operators.chain import Block
 
 class PreloadLoss(Effect):
     """
-    A kink in the static curve where the preload runs out.
+    Kink in the static curve at the voltage where the preload runs out.
 
-    ``x = h - k max(0, theta - v)``: below theta the joint opens, its stiffness is another, and the
-    displacement follows the command with another slope.  The kink is at a voltage, whatever the
-    loops do.
+    ``x = h - k max(0, theta - v)``: below theta the joint opens and its stiffness changes, so the
+    displacement follows the command with another slope.  The kink stays at the same voltage on
+    every loop.
 
     Notes
     -----
@@ -41,7 +41,7 @@ class PreloadLoss(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return kinks at seven places within the range."""
+        """List kinks at seven voltages within the range."""
         places = view.low + view.span * np.arange(1, 8) / 8
         return tuple(cls.trial({'threshold': float(theta)}) for theta in places)
 
@@ -50,12 +50,12 @@ class PreloadLoss(Effect):
         return x0 - self.number('gain') * max(0.0, self.number('threshold') - v0)
 
     def process(self, block: Block) -> Block:
-        """Return the block with the loss below the kink."""
+        """Subtract the loss below the kink from the block."""
         loss = np.maximum(0.0, self.number('threshold') - block.v)
         return block.with_signal(block.x - self.number('gain') * loss)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         step = 'x -= gain * (threshold > v ? threshold - v : 0.0);\n'
         names = ('gain', 'threshold')
         return CCode({name: self.number(name) for name in names}, rest=step, step=step)

@@ -31,12 +31,12 @@ from piezo_ident.operators.parts import (
     weights_of,
 )
 
-#: relative step of the low-pass of the speed, for the slope of the power
+#: relative step of the cutoff for the derivative of the power by it
 NEAR = 1e-5
-#: what scales the growth, and what shapes it, as the loops and their results are ordered
+#: parameters that scale the growth, and parameters that shape it, in the order of the loops
 AMPLITUDES = ('gain', 'stretch', 'lead', 'lead_stretch')
 SHAPE = ('exponent', 'levelling', 'cutoff')
-#: speed below which the slope of its power is taken at it [spans/s]
+#: the slope of the power below this speed is taken at this speed [spans/s]
 SLOW = 1e-3
 
 
@@ -45,20 +45,20 @@ class RateDependentHysteresis(Effect):
     Prandtl-Ishlinskii plays whose thresholds grow with the speed of the input.
 
     ``r_i(k) = r_i (1 + sigma |s(k)|^eps) + beta |s(k)|^eps`` for every play of H, never below
-    zero, where ``s`` is the input's speed behind a first-order low-pass: beta makes all plays
-    wider by the same, sigma each in proportion to itself.  The band of a play of H reaches from
-    v - r to v; its upper edge may move out as well, to ``v + (lambda_0 + lambda_1 r_i)
-    |s(k)|^eps``, so that a band that widens evenly to both sides is a case of it.  With a
-    `levelling` c, ``|s|`` is replaced by ``|s| / (1 + c |s|)``: growth that levels off.
-    The speed is filtered before its magnitude is taken, so that converter steps and noise cancel
-    instead of adding up.  Weights,
-    p1 and p2 stay those of H; what is added to the signal is the difference between the widened
-    plays and the fixed ones, so the effect stacks with others of its slot in any order.
+    zero.  ``s`` is the speed of the input behind a first-order low-pass.  beta widens all plays by
+    the same amount, sigma each play in proportion to its threshold.  The band of a play of H
+    reaches from v - r to v.  Its upper edge may also move, to
+    ``v + (lambda_0 + lambda_1 r_i) |s(k)|^eps``; a band that widens evenly to both sides is a
+    special case.  A `levelling` c replaces ``|s|`` by ``|s| / (1 + c |s|)``, so that the growth
+    levels off.  The speed is filtered before its magnitude is taken: converter steps and noise
+    then cancel instead of adding up.  Weights, p1 and p2 remain those of H.  The effect adds the
+    difference between the widened plays and the fixed plays, so it combines with other effects of
+    its slot in any order.
 
     Notes
     -----
     Speed is in spans a second: a sine over the full range at f Hz peaks at ``pi f``.  A play with
-    r = 0 is part of p2 and stays a straight line.  Plays whose thresholds are functions of time:
+    r = 0 is part of p2 and remains a straight line.  Plays whose thresholds depend on time:
     Al Janaideh, Krejci and Monteiro, "Inverse rate-dependent Prandtl-Ishlinskii operators and
     applications", Applications of Mathematics, 2023, doi:10.21136/AM.2023.0231-22.
     """
@@ -89,14 +89,14 @@ class RateDependentHysteresis(Effect):
     )
 
     def prepare(self) -> None:
-        """Unpack the amplitudes, and compute the pole of the low-pass of the speed."""
+        """Read the amplitudes, and compute the pole of the low-pass of the speed."""
         gain, stretch, lead, lead_stretch = map(self.number, AMPLITUDES)
         self._growth = gain, stretch, lead, lead_stretch
         self.pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return several laws of the speed, growth below alone and on both sides."""
+        """List several laws of the speed, with growth of the lower edge or of both edges."""
         if not np.any(view.thresholds > 0):
             return ()
         trials = []
@@ -118,7 +118,7 @@ class RateDependentHysteresis(Effect):
         return tuple(trials)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: no speed, and the plays where H has them."""
+        """Come to rest: no speed, and plays as in H."""
         w = self.inner.reset(v0, x0)
         plays = self.core
         if isinstance(plays, HysteresisOperator):
@@ -131,7 +131,7 @@ class RateDependentHysteresis(Effect):
         return w
 
     def process(self, block: Block) -> Block:
-        """Return the block with H applied and its plays widened."""
+        """Apply H to the block and widen its plays."""
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
         power = self._power(v, self._speed)
@@ -141,7 +141,7 @@ class RateDependentHysteresis(Effect):
         return inner.with_signal(inner.x + more)
 
     def slopes(self, block: Block) -> dict[str, Array]:
-        """Return the derivatives by all numbers, of one pass; see `Effect.slopes`."""
+        """Compute the derivatives by all parameters in one pass; see `Effect.slopes`."""
         v = np.ascontiguousarray(block.x)
         r, q, *_, low, c = self.hysteresis.for_kernel
         power, bends = self._bent_power(v)
@@ -152,13 +152,13 @@ class RateDependentHysteresis(Effect):
     def of_parts(
         self, block: Block, rest: float, parts: Iterable[tuple[Hysteresis, Array]]
     ) -> Iterator[Array]:
-        """Give what each part of H becomes; see `Effect.of_parts`."""
+        """Yield the output for each part of H; see `Effect.of_parts`."""
         v = np.ascontiguousarray(block.x)
         power = self.power(v, rest)
         for group in in_groups(parts):
             h, _ = group[0]
             if not h.thresholds.size:
-                # nothing grows
+                # a part without plays does not grow
                 yield from columns_of_parts(v, group, rest)
             elif is_single_play(h):
                 for one, start in group:
@@ -171,7 +171,7 @@ class RateDependentHysteresis(Effect):
                 yield from super().of_parts(block, rest, group)
 
     def _moved_apart(self, v: Array, power: Array, group: list[Part]) -> Array:
-        """Return what up to four parts of the same plays become, as rows."""
+        """Compute up to four parts of the same plays, with growth, as rows."""
         h, memory = group[0]
         r, *_, low, _ = h.for_kernel
         moved, out = np.zeros(r.size), np.empty((SIDE_BY_SIDE, v.size))
@@ -181,7 +181,7 @@ class RateDependentHysteresis(Effect):
         return out[: len(group)]
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         h = self.hysteresis
         m = h.thresholds.size
         if m == 0:
@@ -200,7 +200,7 @@ class RateDependentHysteresis(Effect):
             bent = f' + {curve.format("f")} - {curve.format("g")}'
         level = 'power /= 1.0 + levelling * power; ' if self.number('levelling') > 0.0 else ''
         level += 'power = pow(power, exponent);' if self.number('exponent') != 1.0 else ''
-        # a growth that is not there is not computed
+        # terms with a zero coefficient are left out
         half = 'r[i] * (1.0 + stretch * power)' if self.number('stretch') else 'r[i]'
         half += ' + gain * power' if self.number('gain') else ''
         top = 'u + r[i] * (lead_stretch * power)' if self.number('lead_stretch') else 'u'
@@ -237,23 +237,23 @@ class RateDependentHysteresis(Effect):
         )
 
     def power(self, v: Array, v0: float) -> Array:
-        """Return ``|s|^eps`` under an input from rest at v0, both shapes (n,)."""
+        """Compute ``|s|^eps`` for an input from rest at v0, both shapes (n,)."""
         return self._power(np.ascontiguousarray(v), np.array([v0, 0.0]))
 
     def power_and_slope(self, v: Array, v0: float) -> tuple[Array, Array]:
-        """Return what `power` returns, and its slope with the speed s."""
+        """Compute `power`, and its derivative by the speed s."""
         speed = speed_of(np.ascontiguousarray(v), self.pole, self.sample_rate, np.array([v0, 0.0]))
         exponent, levelled = (
             self.number('exponent'),
             1.0 + self.number('levelling') * np.abs(speed),
         )
-        # of a small power the slope at rest has no end
+        # the slope of a small power is infinite at rest
         near = np.maximum(np.abs(speed) / levelled, SLOW) ** (exponent - 1.0)
         slope = exponent * near * np.sign(speed) / levelled**2
         return (np.abs(speed) / levelled) ** exponent, slope
 
     def _bent_power(self, v: Array) -> tuple[Array, Array]:
-        """Return `_power`, and its slopes with exponent, levelling and cutoff, shape (3, n)."""
+        """Compute `_power` and its derivatives by exponent, levelling and cutoff, shape (3, n)."""
         exponent, levelling, cutoff = map(self.number, SHAPE)
         near = float(np.exp(-2 * np.pi * cutoff * (1.0 + NEAR) / self.sample_rate))
         speed, other = (

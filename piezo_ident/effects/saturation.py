@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Saturation: the amplifier runs out of voltage."""
+"""Saturation: the amplifier reaches the end of its voltage range."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, Vie
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
 
-#: beyond this many knees from an end, rounding changes nothing that a float can hold
+#: beyond this many knees from an end, the rounding of the knee is below the precision of a float
 FAR = 40.0
 #: L(z) in C
 _SMOOTH = 'z < 0.0 ? log1p(exp(z)) : z + log1p(exp(-z))'
@@ -44,11 +44,11 @@ def _soften(x: Array, low: float, high: float, knee: float) -> Array:
 
 class Saturation(Effect):
     """
-    The voltage stays between two ends, reached sharply or round a knee.
+    Voltage between two ends, which are reached sharply or with a rounded knee.
 
-    ``va = v - k L((v - high)/k) + k L((low - v)/k)`` with ``L(z) = ln(1 + exp z)`` and k the knee:
-    a straight line of slope one between the ends and flat beyond them, rounded over a few k.  For
-    k = 0 it is ``clip(v, low, high)``; an end at infinity is not there.
+    ``va = v - k L((v - high)/k) + k L((low - v)/k)`` with ``L(z) = ln(1 + exp z)`` and the knee k.
+    The curve is a straight line of slope one between the ends and flat beyond them, rounded over
+    a few k.  For k = 0 it is ``clip(v, low, high)``.  An infinite end does not limit the voltage.
 
     Notes
     -----
@@ -82,7 +82,7 @@ class Saturation(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return one end at a time, at several places near it, sharp and round."""
+        """List one end at a time, at several voltages near it, sharp and round."""
         trials = []
         for inside in (0.02, 0.05, 0.1, 0.2, 0.3):
             for knee in (0.02, 0.2):
@@ -96,11 +96,11 @@ class Saturation(Effect):
         return float(self._limited(np.array([x0]))[0])
 
     def process(self, block: Block) -> Block:
-        """Return the block with its signal limited."""
+        """Limit the signal of the block."""
         return block.with_signal(self._limited(block.x))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         ends = {name: self.number(name) for name in ('low', 'high')}
         knee = self.number('knee')
         if knee == 0.0:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Second-order sections that effects are made of, by the bilinear transform."""
+"""Second-order sections of effects, by the bilinear transform."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from piezo_ident.operators.c_code import CCode
 @kernel
 def _run(x: Array, c: Array, state: Array) -> Array:
     # c: n0, n1, a1, a2; state: the last input and two numbers of the transposed direct form.
-    # The filter works on differences of its input, so that it is at rest to the last bit.
+    # The filter processes differences of its input, so that its output at rest is exactly zero.
     n0, n1, a1, a2 = c[0], c[1], c[2], c[3]
     last, s0, s1 = state[0], state[1], state[2]
     out = np.empty(x.size)
@@ -34,9 +34,9 @@ def _run(x: Array, c: Array, state: Array) -> Array:
 
 def slope_of_mode(frequency: float, sample_rate: float) -> float:
     """
-    Return c in ``s/w -> c (1 - z^-1)/(1 + z^-1)``, exact at the mode's own frequency w.
+    Compute c in ``s/w -> c (1 - z^-1)/(1 + z^-1)``, exact at the frequency w of the mode.
 
-    A frequency that is not below half the sampling rate raises ModelError.
+    Raises ModelError if the frequency is not below half the sampling rate.
     """
     if not frequency < sample_rate / 2.0:
         raise ModelError(
@@ -50,22 +50,22 @@ class SecondOrderSection:
     """
     ``g (M(s) - 1) + k R(s)`` with M = w^2/D, R = w s/D and D = s^2 + 2 zeta w s + w^2.
 
-    With S = s/w the sum is ``(-g (S^2 + 2 zeta S) + k S) / (S^2 + 2 zeta S + 1)``: it has a zero
-    at rest, which is taken out as a difference of the input.
+    With S = s/w the sum is ``(-g (S^2 + 2 zeta S) + k S) / (S^2 + 2 zeta S + 1)``.  It has a zero
+    at frequency 0, which the filter takes as a difference of the input.
 
     Parameters
     ----------
     frequency, damping : float
-        w / 2 pi [Hz] and zeta.
+        Frequency w / 2 pi [Hz] and damping ratio zeta.
     gain, rate_gain : float
-        g and k.
+        Gains g and k.
     sample_rate : float
-        [Hz]
+        Sampling rate [Hz].
 
     Raises
     ------
     ModelError
-        When the frequency is not below half the sampling rate.
+        If the frequency is not below half the sampling rate.
     """
 
     def __init__(
@@ -86,27 +86,27 @@ class SecondOrderSection:
 
     @property
     def coefficients(self) -> Array:
-        """n_0, n_1, a_1 and a_2 of the filter of differences."""
+        """Coefficients n_0, n_1, a_1 and a_2 of the filter of differences."""
         return self._c
 
     @property
     def section(self) -> Array:
-        """b_0, b_1, b_2, a_1 and a_2 of the filter."""
+        """Coefficients b_0, b_1, b_2, a_1 and a_2 of the filter."""
         n0, n1, a1, a2 = self._c
         return np.array([n0, n1 - n0, -n1, a1, a2])
 
     def reset(self, x0: float) -> None:
-        """Come to rest under a constant input; the output is zero then."""
+        """Come to rest under a constant input; the output is then zero."""
         self._state = np.array([x0, 0.0, 0.0])
 
     def process(self, x: Array) -> Array:
-        """Return the filtered signal, shape (n,)."""
+        """Filter a signal, shape (n,)."""
         out: Array = _run(np.ascontiguousarray(x), self._c, self._state)
         return out
 
 
 def sections_in_c(sections: Sequence[SecondOrderSection], signal: str) -> CCode:
-    """Return what adds sections of a signal, named in C, to x."""
+    """Write C code that adds the sections of a signal, given by its name in C, to x."""
     n = len(sections)
     rows = zip(
         ('n0', 'n1', 'a1', 'a2'), np.array([z.coefficients for z in sections]).T, strict=True

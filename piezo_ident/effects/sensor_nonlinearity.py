@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Sensor nonlinearity: what is read is a curved function of what is there."""
+"""Sensor nonlinearity: the reading is a curved function of the displacement."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from piezo_ident.operators.chain import Block
 
 class SensorNonlinearity(Effect):
     """
-    A polynomial between displacement and reading.
+    Polynomial between displacement and reading.
 
     ``y = x + c2 x^2 + c3 x^3 + c4 x^4``, with x and y as shares of the output span.  The error
-    is one and the same function of the displacement at every frequency, behind G and the delay;
-    close to a resonance that separates it from a curvature in front of G.
+    is the same function of the displacement at every frequency, behind G and the delay.  Close
+    to a resonance this distinguishes it from a curvature in front of G.
 
     Notes
     -----
     Strain gauges are off by 0.1 .. 1 % of full scale, capacitive sensors by 0.01 .. 0.1 %:
     A. J. Fleming, "A review of nanometer resolution position sensors: operation and performance",
-    Sensors and Actuators A 190, 2013, doi:10.1016/j.sna.2012.10.016, where the
-    curve is a mapping from displacement to reading, and what calibration leaves of it the error.
+    Sensors and Actuators A 190, 2013, doi:10.1016/j.sna.2012.10.016.  There the curve maps
+    displacement to reading, and the error is the part that calibration leaves.
     """
 
     name = 'sensor_nonlinearity'
@@ -44,7 +44,7 @@ class SensorNonlinearity(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return the square alone, with the cubic, and all."""
+        """List the square alone, with the cubic, and all three powers."""
         return cls.trial({}, ['square']), cls.trial({}, ['square', 'cubic']), cls.trial({})
 
     def reset(self, v0: float, x0: float) -> float:
@@ -52,17 +52,17 @@ class SensorNonlinearity(Effect):
         return float(self._read(np.array([x0]))[0])
 
     def process(self, block: Block) -> Block:
-        """Return the block as the sensor reads it."""
+        """Apply the curve of the sensor to the block."""
         return block.with_signal(self._read(block.x))
 
     def slope(self, block: Block) -> Array:
-        """Return the slope of the curve."""
+        """Compute the slope of the curve."""
         c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))
         x = block.x
         return 1.0 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4)))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         step = 'x += x * x * (square + x * (cubic + x * fourth));\n'
         names = ('square', 'cubic', 'fourth')
         return CCode({name: self.number(name) for name in names}, rest=step, step=step)

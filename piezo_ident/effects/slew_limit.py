@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Slew limit: the amplifier has only so much current for the capacitance of the piezo."""
+"""Slew limit: the current of the amplifier limits how fast it charges the piezo."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _limit(x: Array, most: float, state: Array) -> Array:
 
 class SlewLimit(Effect):
     """
-    The voltage changes by no more than S a second.
+    Voltage that changes by at most S a second.
 
     ``va(k) = va(k-1) + clip(v(k) - va(k-1), -S / f_s, S / f_s)`` with S = I / C, the largest
     current of the amplifier over the capacitance of the piezo: 0.5 A on 20 uF make 75 V in 3 ms.
@@ -67,31 +67,31 @@ class SlewLimit(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return limits at the speeds seen, the lowest too, and on the way to a jump."""
+        """List limits at the speeds of the data, including the lowest, and up to a jump."""
         speeds = np.unique(view.speeds[view.speeds > 0])
         if speeds.size == 0:
             return ()
         fastest = float(speeds[-1])
-        # jumps are too few to show in the quantiles; a limit that never acts changes nothing
+        # jumps are too rare to show in the quantiles; a limit that never acts changes nothing
         jump = max(fastest, 0.5 * view.span * view.sample_rate)
         limits = [*speeds[:-1].tolist(), *(np.array([0.7, 0.8, 0.9]) * fastest)]
         limits += ladder(fastest, jump, 6)[1:]
         return tuple(cls.trial({'limit': limit}) for limit in limits)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: nothing is left to catch up."""
+        """Come to rest with the voltage at the command."""
         self._state = np.array([x0])
         return x0
 
     def process(self, block: Block) -> Block:
-        """Return the block with its signal limited in speed."""
+        """Limit the speed of the signal of the block."""
         most = self.number('limit') / self.sample_rate
         if np.isinf(most):
             return block
         return block.with_signal(_limit(np.ascontiguousarray(block.x), most, self._state))
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         most = self.number('limit') / self.sample_rate
         if np.isinf(most):
             return CCode()

@@ -13,13 +13,13 @@ from piezo_ident.operators.chain import Block
 
 class ThermalDrift(Effect):
     """
-    Displacement that grows with time, whatever the command does.
+    Displacement that grows with time, independent of the command.
 
     ``d(t) = b t + c (1 - exp(-t / tau))``: a steady drift, and a first-order approach to a new
-    temperature, as after switching on.  Time is that of the sample clock, which starts with the
-    record, and not the time since the last reset: a gap in a record does not stop the drift.
-    Before zero there is none.  Rate and size hold for one record: what drifts in another, or after
-    the end, does not follow from them.
+    temperature, as after switching on.  Time is the time of the sample clock.  The clock starts
+    with the record, not with the last reset, so a gap in a record does not stop the drift.  The
+    drift is zero before time zero.  Rate and size hold for one record.  The drift in another
+    record, or after the end, does not follow from them.
 
     Notes
     -----
@@ -43,7 +43,7 @@ class ThermalDrift(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """Return the steady drift, approaches to a new temperature, and both."""
+        """List the steady drift, approaches to a new temperature, and both."""
         long = max(view.duration, 1e-2)
         steps = {'rate': min(0.1, 1e-3 / long)}
         trials = [cls.trial({'time_constant': long}, ['rate'], steps)]
@@ -53,7 +53,7 @@ class ThermalDrift(Effect):
         return tuple(trials)
 
     def process(self, block: Block) -> Block:
-        """Return the block with the drift added."""
+        """Add the drift to the block."""
         t = np.maximum(block.t, 0.0)
         x = block.x + self.number('rate') * t
         if self.number('amplitude'):
@@ -61,7 +61,7 @@ class ThermalDrift(Effect):
         return block.with_signal(x)
 
     def c_code(self) -> CCode:
-        """Return the effect in C."""
+        """Write the effect in C."""
         names = ('rate', 'amplitude', 'time_constant')
         return CCode(
             {name: self.number(name) for name in names},

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The settings at which an effect is tried, and the properties of the data they depend on."""
+"""Settings at which an effect is tried, and the properties of the data that they depend on."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class View:
     Attributes
     ----------
     sample_rate : float
-        [Hz]
+        Sampling rate [Hz].
     low, high : float
         Range of the normalised command u.
     speeds : ndarray, shape (n,)
-        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 of the moving part, then perhaps the
-        maximum.
+        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 of the speeds above zero, and perhaps
+        the maximum.
     duration : float
         Length of the longest record [s].
     channels : mapping of str to (float, float)
@@ -41,13 +41,13 @@ class View:
     thresholds : ndarray, shape (m,)
         Thresholds of H.
     judged : float
-        From the first sample to the last of a record that counts, of the longest one [s].
+        Longest time from the first to the last sample that counts in a record [s].
     first : float
-        When the first sample that counts comes, in the record that has most [s].
+        Time of the first sample that counts, in the record with most samples that count [s].
     last : float or None
-        When the last record ends, by the same clock [s]; None where that is `duration`.
+        End of the last record on the same clock [s]; None if it equals `duration`.
     is_fast : bool
-        Whether dynamics matter in these data.
+        Whether dynamics matter in the data.
     """
 
     sample_rate: float
@@ -85,18 +85,18 @@ class View:
 @dataclass(frozen=True, eq=False)
 class Trial:
     """
-    One way to try an effect: its values, and the amplitudes that move.
+    One way to try an effect: its values, and the amplitudes that are moved.
 
     Attributes
     ----------
     values : mapping
         One value for each parameter; amplitudes are neutral.
     moves : tuple of (str, int or None)
-        The amplitudes that are moved, one column each: name and, in a list, index.  Empty for an
-        effect without amplitudes: it is switched on in `values`, and its column is the difference
-        between on and off.
+        Amplitudes that are moved, one column each: name and, in a list, index.  Empty for an
+        effect without amplitudes.  Such an effect is switched on in `values`, and its column is
+        the difference between on and off.
     steps : tuple of float
-        Step of each.
+        Step of each moved amplitude.
     """
 
     values: Mapping[str, Any]
@@ -107,7 +107,7 @@ class Trial:
         object.__setattr__(self, 'values', MappingProxyType(dict(self.values)))
 
     def settings(self) -> list[dict[str, Any]]:
-        """Return one complete set of parameters for each column."""
+        """Make one complete set of parameters for each column."""
         if not self.moves:
             return [dict(self.values)]
         return [
@@ -117,14 +117,14 @@ class Trial:
 
 
 def number_of(values: Mapping[str, Any], name: str, index: int | None) -> float:
-    """Return one number; an index is its place in a list."""
+    """Read one number; the index is its place in a list."""
     return float(values[name] if index is None else values[name][index])
 
 
 def with_number(
     values: Mapping[str, Any], name: str, index: int | None, number: float
 ) -> dict[str, Any]:
-    """Return values with one number replaced."""
+    """Replace one number in the values."""
     if index is None:
         return {**values, name: number}
     vector = np.array(values[name], dtype=np.float64)
@@ -133,5 +133,5 @@ def with_number(
 
 
 def ladder(low: float, high: float, count: int) -> list[float]:
-    """Return `count` numbers from `low` to `high` in equal ratios."""
+    """Space `count` numbers from `low` to `high` in equal ratios."""
     return [float(x) for x in np.geomspace(low, max(low, high), count)]
