@@ -34,7 +34,7 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from side_by_side import machine
-from study_rows import all_rows, section, some
+from study_rows import all_rows, section, some, write_cases
 from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, program
 
 RATE = 20_000.0
@@ -211,44 +211,53 @@ def is_told(case: Case, row: Row) -> bool:
 
 
 KINDS = ('exact', 'class', 'hidden', 'partly', 'refitted', 'unexplained', 'none', 'wrong')
+VERDICTS = ('named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none')
+PURPOSE = (
+    'This page tells whoever must trust a verdict how often it was right on simulated stages '
+    'that are sums of plays with something added. '
+    '[The second study](diagnosis_study_foreign.md) has stages that are no sums of plays.'
+)
 NOTE = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
-    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. Its laws are '
-    'not those of the candidates (below). An effect counts by its size: the free-run error that '
-    'a refit of a sum of plays leaves on kinds of motion held out, in % of stroke; '
-    f'{COUNTS} % and more is counted. Hidden: no name, but among two or three '
-    'that may hide in the base model.'
+    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. The laws of '
+    'the stages (below) are not those of the candidates. The size of an effect is the free-run '
+    'error that a refit of a sum of plays leaves on kinds of motion held out, in % of stroke. An '
+    f'effect of {COUNTS} % and more is counted. Hidden: the verdict has no name, and the effect '
+    'is among two or three that may hide in the base model.'
 )
 Done = Sequence[tuple[Case, Row]]
 
 
+def line(name: str, own: Done) -> list[object]:
+    """Return a row of a table: the outcomes, and the median errors on the unseen record."""
+    outcomes = [outcome(case, row) for case, row in own]
+    medians = [
+        f'{np.median([getattr(r, error) for _, r in own]):.3f}' if own else ''
+        for error in ('unseen_before', 'unseen_after')
+    ]
+    return [name, len(own), *(outcomes.count(kind) for kind in KINDS), *medians]
+
+
+HEADS = f'counted, {", ".join(KINDS)}, unseen error before, after'
+
+
 def single(done: Done) -> str:
     """Return the section of stages with one effect."""
-
-    def line(effect: str) -> list[object]:
-        own = [(c, r) for c, r in counted if c.effects == (effect,)]
-        outcomes = [outcome(case, row) for case, row in own]
-        medians = [
-            f'{np.median([getattr(r, name) for _, r in own]):.3f}' if own else ''
-            for name in ('unseen_before', 'unseen_after')
-        ]
-        return [effect, len(own), *(outcomes.count(kind) for kind in KINDS), *medians]
-
     counted = [(c, r) for c, r in done if c.kind == 'one' and r.size >= COUNTS]
-    heads = f'effect, counted, {", ".join(KINDS)}, unseen error before, after'
     outcomes = [outcome(case, row) for case, row in counted]
     exact, named, wrong, hidden = (
         some(outcome in kinds for outcome in outcomes)
         for kinds in (('exact',), ('exact', 'class'), ('wrong',), ('hidden',))
     )
-    text = section('One effect', heads, map(line, EFFECTS))
-    text += f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; '
-    text += f'no name, and among what may hide in the base model: {hidden}. '
+    lines = (line(name, [x for x in counted if x[0].effects == (name,)]) for name in EFFECTS)
+    text = section('One effect', f'effect, {HEADS}', lines)
     stated = some(set(row.found) == set(case.effects) for case, row in counted)
     told = some(is_told(case, row) for case, row in counted)
-    text += 'As the second study counts, where what stands among the effects is named, however '
-    text += f'much is left and whatever is as good: {stated}; with classes, that of a refit '
-    text += f'included: {told}.'
+    text += (
+        f'\n\nExact name: {exact}; exact name or its class: {named}; wrong: {wrong}; no name, and '
+        f'among what may hide in the base model: {hidden}. The second study counts an effect as '
+        f'named however much is left: {stated}; with classes, that of a refit included: {told}.'
+    )
     ratios = [
         r.unseen_before / r.unseen_after for _, r in counted if r.verdict in ('named', 'class')
     ]
@@ -276,50 +285,67 @@ def none(done: Done) -> str:
 def outside(done: Done) -> str:
     """Return the section of effects that are not among the candidates."""
     own = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
+
+    def counts(kind: str) -> list[object]:
+        verdicts = [r.verdict for c, r in own if c.kind == kind]
+        return [len(verdicts), *(verdicts.count(verdict) for verdict in VERDICTS)]
+
     text = section(
-        'The own candidate taken out of the catalogue, and effects outside it',
-        'truth, seed, size, verdict, added, class',
-        ([c.effects[0], c.seed, f'{r.size:.2f}', *_names(r)] for c, r in own),
+        'Effects that are no candidates',
+        f'truth, counted, {", ".join(VERDICTS)}',
+        (
+            ['a candidate taken out of the catalogue', *counts('removed')],
+            ['an effect outside the catalogue', *counts('outside')],
+        ),
     )
     return f'{text}\n\nA wrong name in {some(r.verdict == "named" for _, r in own)}.'
 
 
-def _names(row: Row) -> list[str]:
-    return [row.verdict, ', '.join(row.found), ', '.join(row.group)]
+def pairs(done: Done) -> str:
+    """Return the section of stages with two effects."""
+    own = [(set(c.effects), set(r.found)) for c, r in done if c.kind == 'pair']
+    counts = (
+        ('both', sum(found == truth for truth, found in own)),
+        ('one of the two', sum(bool(found) and found < truth for truth, found in own)),
+        ('an effect that is not there', sum(bool(found - truth) for truth, found in own)),
+        ('none', sum(not found for _, found in own)),
+    )
+    return section('Two effects', 'named, cases', counts)
 
 
-def table(rows: dict[str, Row], todo: Sequence[Case]) -> str:
-    """Return the study as text."""
+CASE_HEADS = (
+    'kind, truth, strength, seed, noise, verdict, added, class, size, unseen before, unseen after'
+)
+
+
+def case_line(case: Case, row: Row) -> list[object]:
+    """Return one case as a line of the CSV file."""
+    names = [row.verdict, ', '.join(row.found), ', '.join(row.group)]
+    errors = [f'{x:.3f}' for x in (row.size, row.unseen_before, row.unseen_after)]
+    truth = ', '.join(case.effects)
+    return [case.kind, truth, f'{case.size:g}', case.seed, case.noise, *names, *errors]
+
+
+def write(rows: dict[str, Row], todo: Sequence[Case], page: Path) -> None:
+    """Write the page of the study, and the file of its cases."""
     done = [(case, rows[case.key]) for case in todo if case.key in rows]
-    unseen = {c.key: [f'{r.unseen_before:.3f}', f'{r.unseen_after:.3f}'] for c, r in done}
     sections = [
         '# How often the diagnosis is right',
+        PURPOSE,
         f'Made by `make study`; {len(done)} of {len(todo)} cases done.\nMachine: {machine()}.',
         NOTE,
+        write_cases(page, CASE_HEADS, (case_line(c, r) for c, r in done)),
         single(done),
         none(done),
         outside(done),
-        section(
-            'Pairs',
-            'truth, size, verdict, added, class, unseen before, after',
-            (
-                [', '.join(c.effects), f'{r.size:.2f}', *_names(r), *unseen[c.key]]
-                for c, r in done
-                if c.kind == 'pair'
-            ),
-        ),
+        pairs(done),
         section(
             'Laws of the stages',
             'effect, law',
             ([name, describe(name)] for name in (*EFFECTS, *OUTSIDE)),
         ),
-        section(
-            'Every case',
-            'case, verdict, added, class, size, unseen',
-            ([r.key, *_names(r), f'{r.size:.3f}', ' → '.join(unseen[c.key])] for c, r in done),
-        ),
     ]
-    return '\n\n'.join(sections) + '\n'
+    page.write_text('\n\n'.join(sections) + '\n', encoding='utf-8')
 
 
 def main() -> None:
@@ -336,7 +362,7 @@ def main() -> None:
         drawn = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
         todo = [todo[i] for i in drawn]
     rows = all_rows(arguments.kept, Row, todo, judged, arguments.processes)
-    arguments.out.write_text(table(rows, todo), encoding='utf-8')
+    write(rows, todo, arguments.out)
     sys.stdout.write(f'{arguments.out}\n')
 
 

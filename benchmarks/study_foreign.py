@@ -44,7 +44,7 @@ from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from side_by_side import machine
-from study_rows import all_rows, part_of, section, some
+from study_rows import all_rows, part_of, section, some, write_cases
 from truths import other_axis
 
 #: in the data, not in the stage: they count whatever their size
@@ -365,17 +365,21 @@ def outcome(row: Row) -> str:
 
 
 OUTCOMES = ('named', 'class', 'part', 'hidden', 'abstained', 'false', 'failed')
+PURPOSE = (
+    'This page tells whoever must trust a verdict how often it was right on simulated stages '
+    'that are no sums of plays, as a measured stage is none.'
+)
 NOTE = (
-    'No stage here is a sum of plays. Its hysteresis is of another family, behind two or three '
-    'lightly damped modes and a delay of any fraction of a sample, at 10, 20 or 50 kHz, over '
-    '0..10, 0..100 or -20..130 V, for 5 to 200 um of stroke of either sign, with white or 1/f '
-    'noise or a converter of 10 or 12 bits. Two thirds of the cases are labelled and follow the '
-    "package's own program; the others are one stretch each that starts anywhere. Each is "
-    'identified from one record, diagnosed on another, and judged on a third of other motion. '
-    'What G or H would be identified with sets in behind the identification. '
+    'The hysteresis of a stage is of another family, behind two or three lightly damped modes '
+    'and a delay of any fraction of a sample, at 10, 20 or 50 kHz, over 0..10, 0..100 or '
+    '-20..130 V, for 5 to 200 um of stroke of either sign, with white or 1/f noise or a converter '
+    "of 10 or 12 bits. Two thirds of the cases are labelled and follow the package's own program. "
+    'The others are one stretch each that starts anywhere. Each stage is identified from one '
+    'record, diagnosed on another, and judged on a third of other motion. An effect that would '
+    'change the identified G or H sets in behind the identification.\n\n'
     'The misfit of a core is the unseen error of the same stage without its effects, by forty '
     'plays with the true linear part. The size of an effect is the rms of what it changes on the '
-    'diagnosis record, behind an offset and a gain, % of stroke. Lines, channels and faults of '
+    'diagnosis record, behind an offset and a gain, in % of stroke. Lines, channels and faults of '
     'the data count whatever their size, other effects from the misfit on. A name is false where '
     'it is neither true nor in a class that holds the truth.'
 )
@@ -500,48 +504,47 @@ def by_core(rows: Sequence[Row]) -> str:
     return section('Cores', heads, lines)
 
 
-def every(rows: Sequence[Row]) -> str:
-    """Return a line for each case."""
-    heads = (
-        'case, misfit, size (left by a refit), verdict, named, class, faults, outcome, '
-        'before, refit, promised, unseen before, after'
-    )
-
-    def line(r: Row) -> list[object]:
-        sizes = ', '.join(f'{r.truth[n]:.2f} ({r.left[n]:.2f})' for n in r.truth)
-        errors = (r.before, r.refit, r.after, r.centred_before, r.centred_after)
-        said = outcome(r)
-        if false_names(r):
-            said += ': ' + ', '.join(false_names(r))
-        return [
-            r.key,
-            f'{r.misfit:.2f}',
-            sizes,
-            r.verdict if r.verdict != 'failed' else r.error.replace('|', '/'),
-            ', '.join(r.effects),
-            ', '.join(r.group),
-            ', '.join(r.faults),
-            said,
-            *(f'{x:.3f}' for x in errors),
-        ]
-
-    return section('Every case', heads, map(line, rows))
+CASE_HEADS = (
+    'case, misfit, size (left by a refit), verdict, named, class, faults, outcome, '
+    'before, refit, promised, unseen before, unseen after'
+)
 
 
-def table(rows: dict[str, Row], todo: Sequence[Case], group: str) -> str:
-    """Return the study as text."""
+def case_line(r: Row) -> list[object]:
+    """Return one case as a line of the CSV file."""
+    sizes = ', '.join(f'{r.truth[n]:.2f} ({r.left[n]:.2f})' for n in r.truth)
+    errors = (r.before, r.refit, r.after, r.centred_before, r.centred_after)
+    said = outcome(r)
+    if false_names(r):
+        said += ': ' + ', '.join(false_names(r))
+    return [
+        r.key,
+        f'{r.misfit:.2f}',
+        sizes,
+        r.verdict if r.verdict != 'failed' else r.error,
+        ', '.join(r.effects),
+        ', '.join(r.group),
+        ', '.join(r.faults),
+        said,
+        *(f'{x:.3f}' for x in errors),
+    ]
+
+
+def write(rows: dict[str, Row], todo: Sequence[Case], group: str, page: Path) -> None:
+    """Write the page of the study, and the file of its cases."""
     done = [rows[case.key] for case in todo if case.key in rows]
     sections = [
         '# How often the diagnosis is right on stages of another family',
+        PURPOSE,
         f'Made by `make study`, set `{group}`; {len(done)} of {len(todo)} cases done.\n'
         f'Machine: {machine()}.',
         NOTE,
+        write_cases(page, CASE_HEADS, map(case_line, done)),
         summary(done),
         by_effect(done),
         by_core(done),
-        every(done),
     ]
-    return '\n\n'.join(sections) + '\n'
+    page.write_text('\n\n'.join(sections) + '\n', encoding='utf-8')
 
 
 def main() -> None:
@@ -559,7 +562,7 @@ def main() -> None:
     todo = [case for case in todo if re.search(arguments.only, case.key)]
     path = arguments.kept or Path(f'build/study_foreign_{group}.jsonl')
     rows = all_rows(path, Row, todo, judged, arguments.processes)
-    arguments.out.write_text(table(rows, todo, group), encoding='utf-8')
+    write(rows, todo, group, arguments.out)
     sys.stdout.write(f'{arguments.out}\n')
 
 

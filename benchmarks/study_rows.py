@@ -1,11 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the studies of the diagnosis share: rows that are kept in a file, and their tables."""
+"""The rows of the studies of the diagnosis: kept in a file, as tables, and as CSV."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+import csv
 from dataclasses import asdict, fields
 import json
 import multiprocessing
@@ -30,6 +31,17 @@ def some(facts: Iterable[object]) -> str:
 def section(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
     """Return a section with a table; the heads are separated by commas."""
     return f'## {title}\n\n{markdown(heads.split(", "), rows)}'
+
+
+def write_cases(page: Path, heads: str, rows: Iterable[Sequence[object]]) -> str:
+    """Write one line for each case into a CSV file beside a page, and return the page's link."""
+    target = page.with_suffix('.csv')
+    lines = list(rows)
+    with target.open('w', encoding='utf-8', newline='') as file:
+        csv.writer(file, lineterminator='\n').writerows([heads.split(', '), *lines])
+    return (
+        f'Every case: [{target.name}]({target.name}), {len(lines)} lines; errors in % of stroke.'
+    )
 
 
 def read_rows(path: Path, kind: type) -> dict[str, Any]:

@@ -4,6 +4,7 @@
 """The stages of another family and the rules by which a diagnosis of them is counted."""
 
 import ast
+import csv
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,8 +15,10 @@ from foreign.stage import Linear, make_core
 import numpy as np
 import pytest
 import study_foreign as study
+from study_rows import write_cases
 
-FOLDER = Path(__file__).resolve().parents[1] / 'benchmarks'
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / 'benchmarks'
 
 
 def test_stages_know_nothing_of_what_is_judged():
@@ -323,3 +326,31 @@ def test_the_smallest_dynamics_of_those_that_do_as_well_are_chosen():
     assert model.dynamics.a.size <= 4
     ((_, error),) = study.unseen_errors(records.unseen, model)
     assert error < 0.18
+
+
+def test_the_cases_of_a_page_are_in_the_file_beside_it(tmp_path):
+    row = study.Row(
+        'final-000 gap-shares creep labelled',
+        'class',
+        effects=('creep',),
+        group=('creep', 'thermal_drift'),
+        truth={'creep': 0.4, 'backlash': 0.1},
+        left={'creep': 0.3, 'backlash': 0.05},
+        misfit=0.2,
+    )
+    link = write_cases(tmp_path / 'page.md', study.CASE_HEADS, [study.case_line(row)])
+    assert '(page.csv)' in link
+    with (tmp_path / 'page.csv').open(encoding='utf-8', newline='') as file:
+        (found,) = csv.DictReader(file)
+    assert found['class'] == 'creep, thermal_drift'
+    assert found['size (left by a refit)'] == '0.40 (0.30), 0.10 (0.05)'
+    assert found['outcome'] == study.outcome(row)
+
+
+@pytest.mark.parametrize('name', ['diagnosis_study', 'diagnosis_study_foreign'])
+def test_a_page_counts_the_lines_of_its_file(name):
+    page = (ROOT / f'docs/{name}.md').read_text(encoding='utf-8')
+    with (ROOT / f'docs/{name}.csv').open(encoding='utf-8', newline='') as file:
+        lines = list(csv.DictReader(file))
+    assert f'{len(lines)} of {len(lines)} cases done' in page
+    assert f'({name}.csv), {len(lines)} lines' in page

@@ -23,6 +23,9 @@ def test_the_site_builds_without_a_warning(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
+    # the cases of the studies, which the pages link
+    loaded = {path.name for path in (tmp_path / 'site').rglob('*.csv')}
+    assert loaded == {path.name for path in DOCS.glob('*.csv')}
     # what a browser would ask other machines for as it opens a page
     page = (tmp_path / 'site' / 'index.html').read_text(encoding='utf-8')
     assert not re.findall(r'(?:src|<link[^>]* href)="(?:https?:)?//[^"]*', page)
