@@ -34,7 +34,7 @@ from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders
 from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
-from side_by_side import last_line, markdown, peak_memory, seconds, show, take_turns, versions
+from side_by_side import last_line, markdown, peak_memory, seconds, show, take_turns
 
 #: points at the large end through which the exponent is drawn
 LARGE_END = 3
@@ -82,32 +82,31 @@ def length(size: float) -> str:
     return f'{size / 60:g} min' if size < 3600 else f'{size / 3600:g} h'
 
 
-def along_the_record(
-    kind: str, sizes: Sequence[float], folder: Path
-) -> tuple[list[list[str]], str]:
-    """Return the rows of one measure over the record length, and what they say."""
+def along_the_record(kind: str, sizes: Sequence[float], folder: Path) -> list[list[str]]:
+    """Return the rows of one measure over the record length; the last one says how it grows."""
     found = [measured(kind, size, folder) for size in sizes]
     times, peaks = [f[0] for f in found], [f[2] for f in found]
     rows = [
-        [length(size), f'{n:,.0f}', seconds(t), seconds(t / n), f'{peak:.0f} MiB']
+        [PLANS[kind][0], length(size), f'{n:,.0f}', seconds(t), seconds(t / n), f'{peak:.0f}']
         for size, (t, n, peak) in zip(sizes, found, strict=True)
     ]
-    if len(sizes) < 2:
-        return rows, ''
-    more, samples = peaks[-1] - peaks[0], (found[-1][1] - found[0][1]) / 1e6
-    return rows, (
-        f'Exponent {exponent(sizes, times):.2f}; peak memory grows by {more / samples:.2f} MiB '
-        'per million samples.'
-    )
+    growth = ['', '']
+    if len(sizes) > 1:
+        more, samples = peaks[-1] - peaks[0], (found[-1][1] - found[0][1]) / 1e6
+        growth = [f'{exponent(sizes, times):.2f}', f'{more / samples:.2f}']
+    return [*([*row, '', ''] for row in rows[:-1]), [*rows[-1], *growth]]
 
 
-HEADS = ('record', 'samples', 'time', 'a sample', 'peak memory')
+HEADS = (
+    *('work', 'record', 'samples', 'time', 'a sample', 'peak / MiB'),
+    *('exponent', 'MiB per million samples'),
+)
 
 
 def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
     """Return the sections over the record length."""
     base = measured('nothing', 0.0, folder)[2]
-    text, notes = [], []
+    rows, notes = [], []
     # the hour as a bag takes some gigabytes for a moment, and what is made of it too
     has_room = shutil.disk_usage(folder).free >= 4 * HOUR * BAG_BYTES + SPARE
     for kind, (title, sizes, few) in PLANS.items():
@@ -115,8 +114,7 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
         if kind in OF_BAGS and HOUR in lengths and not has_room:
             lengths = lengths[:-1]
             notes.append(f'Too little room on the disk for a bag of 1 h ({title.lower()}).')
-        rows, line = along_the_record(kind, lengths, folder)
-        text += [f'**{title}.** {line}'.strip(), '', markdown(HEADS, rows), '']
+        rows += along_the_record(kind, lengths, folder)
     for path in folder.glob('bag_*'):
         shutil.rmtree(path)
     intro = (
@@ -124,7 +122,8 @@ def of_length(quick: bool, folder: Path) -> list[tuple[str, str]]:
         'of log time over log length through the '
         f'{LARGE_END} longest. A process that does next to nothing peaks at {base:.0f} MiB.'
     )
-    return [('Growth with the record', '\n'.join([intro, '', *text, *notes]))]
+    text = [intro, '', markdown(HEADS, rows), '', *notes]
+    return [('Growth with the record', '\n'.join(text))]
 
 
 def table_of(what: str, sizes: Sequence[int], columns: dict[str, list[float]]) -> str:
@@ -221,7 +220,6 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
             of_orders(quick),
             f'The stage has {EFFECT}; the first candidate is that one.',
             of_candidates(quick, folder),
-            versions('numpy', 'scipy', 'numba', 'rosbags') + '.',
         ]
     return [*found, ('Growth with thresholds, orders and candidates', '\n\n'.join(parts))]
 

@@ -35,7 +35,7 @@ from piezo_ident.identification.step2_dynamics import arx_factor, scan_orders, s
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Dynamics
 from scipy.signal import lfilter
-from side_by_side import markdown, ratio, seconds, show, take_turns, Turn, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, Turn
 
 #: delay of the stage [samples], which all are told
 DELAY = 3
@@ -230,27 +230,22 @@ def _text(turns: dict[str, Turn], base: str, most: int, runs: int, table: str) -
     fastest = min(same, key=lambda name: same[name].median)
     return f"""\
 Orders na, nb = 1..{most} at a known delay, {SAMPLES:,} samples of the noise segment of
-`stage_paper`, {runs} paired turns, each with another sensor noise. All may use the first 80 %; the
-error is that of a free run over the last 20 %, by one and the same filter. Ours fits on 60 %,
-chooses by free run on 20 %, and fits the order found to both.
+`stage_paper`, {runs} paired turns, each with another sensor noise. All may use the first 80 %. The
+error is that of a free run over the last 20 %.
 
 {table}
 
 Fastest peer over the same orders: {fastest}, {ratio(same[fastest].over(turns[base]))} times our
 time.
 
-- sippy_unipi: `system_identification` with `"ARX"`, `IC="BIC"` and our delay. Its regressors are
-  filled in a Python loop that copies the whole past at every sample, so its time grows with the
-  square of the record: a shorter one would flatter it. It finds the delay too when given a range,
-  and has ARMAX, Box-Jenkins and subspace models, which we lack.
+- sippy_unipi: `system_identification` with `"ARX"`, `IC="BIC"` and our delay. Its time grows with
+  the square of the record. It also finds the delay, and has ARMAX, Box-Jenkins and subspace
+  models, which we lack.
 - SysIdentPy at every order: linear `FROLS` with `LeastSquares` and as many terms as the order has,
-  which is not what it is made for.
-- SysIdentPy with its own terms: `FROLS` over the same {2 * most} lags, taken one after the other
-  by what they explain. That is another search, of {2 * most} nested models with holes in their
-  lags instead of {most * most} orders; it can do with fewer terms, and takes nonlinear ones by the
-  same call, which we do not.
-
-{versions('sippy_unipi', 'sysidentpy', 'numpy', 'scipy', 'numba')}."""
+  a use that it is not made for.
+- SysIdentPy with its own terms: `FROLS` over the same {2 * most} lags, one after the other. It
+  searches {2 * most} nested models instead of {most * most} orders, and takes nonlinear terms by
+  the same call."""
 
 
 if __name__ == '__main__':

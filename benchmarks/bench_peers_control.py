@@ -21,7 +21,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.record.record import Piece
 from scipy.signal import lfilter
-from side_by_side import markdown, ratio, seconds, show, take_turns, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns
 
 RATE = 20_000.0
 
@@ -74,16 +74,12 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     text = f"""\
 A 50 Hz sine of {n:,} samples through `stage_paper`, {runs} paired turns. Ours scales, goes through
 {model.hysteresis.thresholds.size} plays and the cubic, G of order ({G.a.size}, {G.b.size}) and the
-delay, and scales back; the others get w, the output of H, and simulate G and the delay alone from
-zero. Their results are held against ours for the same part.
+delay, and scales back. The others get w, the output of H, and simulate G and the delay alone.
 
 {markdown(heads, rows)}
 
-python-control steps through the state space in Python, for systems of any number of inputs, with
-initial states and any sampling; it is made for design, not for long records. `lfilter` runs the
-same recursion in C, and is all that is needed where there is no hysteresis.
-
-{versions('control', 'scipy', 'numpy', 'numba')}."""
+python-control steps through the state space in Python; it is made for design. `lfilter` runs the
+same recursion in C."""
     return [('Free run of the whole model, and the linear part alone', text)]
 
 

@@ -39,7 +39,7 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Record
-from side_by_side import markdown, seconds, show, take_turns, versions
+from side_by_side import markdown, seconds, show, take_turns
 
 DATA = Path(
     os.environ.get('PIEZO_IDENT_DATA', Path(__file__).resolve().parents[2] / 'shared' / 'data')
@@ -315,17 +315,17 @@ def measured(quick: bool) -> str:
     return f"""\
 `{MEASURED}`: {piece.n:,} samples at {rate:g} Hz, rest, a step that rings, then a 1 Hz sine of
 full size; the last {HELD} s are held out. Errors are {FORMULA}. Ours fits everything
-before them, delay and resonance included, and predicts the whole record; the peers fit the sine
+before them, delay and resonance included, and predicts the whole record. The peers fit the sine
 alone ({(n_fit - begin) / rate:.1f} s from {BEGIN} s on) and predict the held-out part from its
-measured start. Sensor noise at rest: {floor:.3f} % of stroke, which remains in every error.
+measured start. Sensor noise at rest, {floor:.3f} % of stroke, remains in every error.
 
 {markdown(HEADS, rows + more)}
 
 {notes}
 
-Where one loop repeats, a NARX polynomial of few terms is all that is needed, fitted in no time
-once its setting is known, and pysindy gives an equation that can be read. Both know this loop at
-this frequency alone, as the next table shows, and neither finds a delay or a resonance."""
+Where one loop repeats, a NARX polynomial of few terms is enough, and pysindy gives an equation
+that can be read. Both know this loop at this frequency alone; neither finds a delay or
+a resonance."""
 
 
 def other_motions(quick: bool) -> str:
@@ -361,8 +361,8 @@ def other_motions(quick: bool) -> str:
     rows = our_rows(record, settings, errors, 1 if quick else 5)
     more, notes = peer_rows(case, 2 if quick else 5)
     return f"""\
-`stage_dense`, whose forty thresholds are none of ours. The peers fit the triangle of growing
-amplitude ({(triangle.stop - triangle.start) / rate:.1f} s), ours the whole identification record
+`stage_dense` has forty thresholds of its own. The peers fit the triangle of growing amplitude
+({(triangle.stop - triangle.start) / rate:.1f} s), ours the whole identification record
 ({record.duration:.1f} s), dynamics and delay included. Held out: minor loops at three biases and a
 decaying triangle ({truth.duration:.1f} s), against the noise-free stage, in free run from rest.
 
@@ -370,20 +370,16 @@ decaying triangle ({truth.duration:.1f} s), against the noise-free stage, in fre
 
 {notes}
 
-A NARX model of few lags has no place for turning points that lie further back; neither has an
-equation in y and v alone. That is what the plays of H are for."""
+A NARX model of few lags, or an equation in y and v alone, has no memory for turning points that
+lie further back. The plays of H are that memory."""
 
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
     warnings.filterwarnings('ignore')
-    installed = versions('sysidentpy', 'pysindy', 'scikit-learn', 'numpy', 'scipy', 'numba')
     return [
-        ('Hysteresis: a measured loop', f'{measured(quick)}\n\n{installed}.'),
-        (
-            'Hysteresis: other motions than the fitted one',
-            f'{other_motions(quick)}\n\n{installed}.',
-        ),
+        ('Hysteresis: a measured loop', measured(quick)),
+        ('Hysteresis: other motions than the fitted one', other_motions(quick)),
     ]
 
 

@@ -39,7 +39,7 @@ from piezo_ident.identification.step3_hysteresis import (
 from piezo_ident.identification.three_steps import triangle_excerpts
 from piezo_ident.model.simulated_stage import SimulatedStage
 from scipy.optimize import differential_evolution
-from side_by_side import markdown, ratio, seconds, show, take_turns, Turn, versions
+from side_by_side import markdown, ratio, seconds, show, take_turns, Turn
 
 #: operators of H, that at r = 0 included
 OPERATORS = 10
@@ -221,17 +221,12 @@ when the loss is within 1 % of what `scipy.optimize.lsq_linear` finds.
 
 The swarm of pyswarms takes {ratio(turns[ring].over(turns[base]))} times our time.
 
-- pyswarms: static ring with k = 7, the best of some thirty settings tried on two or three seeds:
-  both topologies, 24 to 200 particles, w 0.6 to 0.9 constant and falling, c 0.8 to 1.7, all walls
-  and velocity handlers, clamped velocities. With its default wall (`periodic`) a weight of zero is
-  out of its reach. It offers topologies, handlers and histories that ours does not.
+- pyswarms: static ring with k = 7, the best of some thirty settings tried on two or three seeds.
+  It offers topologies, handlers and histories that ours does not.
 - differential_evolution: `popsize=5, recombination=0.95`, the best of ten settings. It needs the
-  fewest evaluations by far; ours is ahead by what one evaluation costs in a compiled loop. Where
-  an evaluation is expensive, it is the better choice.
-- Neither is needed here: bounded least squares finds the optimum itself in
-  {seconds(task.optimum_time)}, and polishes what the swarm found. The swarm is the paper's.
-
-{versions('pyswarms', 'scipy', 'numpy', 'numba')}."""
+  fewest evaluations, and is the better choice where an evaluation is expensive.
+- Bounded least squares finds the optimum itself in {seconds(task.optimum_time)}. The swarm is the
+  paper's."""
     return [('Swarm to the same loss', text)]
 
 

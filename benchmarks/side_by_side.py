@@ -28,7 +28,7 @@ import numpy as np
 #: whose versions a page names, where they are installed
 LIBRARIES = (
     *('numpy', 'scipy', 'numba', 'llvmlite', 'rosbags', 'sippy_unipi', 'sysidentpy', 'pysindy'),
-    *('pyswarms', 'control', 'dask', 'distributed'),
+    *('scikit-learn', 'pyswarms', 'control', 'dask', 'distributed'),
 )
 
 

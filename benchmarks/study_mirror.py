@@ -63,20 +63,19 @@ NAMES = {
 TEXT = """\
 # A measured fast steering mirror
 
-`make mirror` made this page, in {minutes:.1f} minutes on {cores} cores{beside}.
+This page shows, on a measured stage of three axes, how an effect inside the mechanics is named.
+`make mirror` made it, in {minutes:.1f} minutes on {cores} cores{beside}.
 
 The fine steering mirror of CubeSpec has three piezo actuators and three displacement sensors. The
 records are the training part of a public benchmark: M. Floren, KU Leuven,
-[doi:10.5281/zenodo.19591136](https://doi.org/10.5281/zenodo.19591136), CC BY 4.0, unchanged; none
-of it is part of this project. Orthogonal multisines of random phase up to 3 kHz drive all three
-voltages at once, at 100, 200 and 300 mV rms: six realisations of 8192 samples at 6.4 kHz each, two
-periods in steady state.
+[doi:10.5281/zenodo.19591136](https://doi.org/10.5281/zenodo.19591136), CC BY 4.0; none of it is
+part of this project. Orthogonal multisines of random phase up to 3 kHz drive all three voltages at
+once, at 100, 200 and 300 mV rms: six realisations of 8192 samples at 6.4 kHz each, two periods in
+steady state.
 
-**Held out**: realisations {held_out} (from zero) at each amplitude. No fit saw them, and the order
-was chosen by realisation 3 at 200 mV; which effect is named was decided by them. The form of
-the candidates - what softens, how many plays, the time constant - was found with their errors in
-view, so the test part of the benchmark, which is kept apart and not used here, is the one clean
-judge.
+**Held out**: realisations {held_out} (from zero) at each amplitude. They decide which effect is
+named. The form of the candidates was found with their errors in view; the test part of the
+benchmark, which is not used here, is the one clean judge.
 
 ## What a linear model lacks
 
@@ -86,15 +85,14 @@ judge.
 |---|---|---|---|---|---|
 {rows}
 
-The error is 100 rms(y - y_hat) / rms(y) in free run over the second period: of all outputs and
-realisations held out pooled, and in the fifth column the mean of that of each output and each
-realisation, for 100 / 200 / 300 mV. The published rows are pooled over all outputs of the test
-part; no data but the training part made the others. Times are those of the fits of this run.
+The error is 100 rms(y - y_hat) / rms(y) in free run over the second period, pooled over all
+outputs and realisations held out. The fifth column is the mean over outputs and realisations, for
+100 / 200 / 300 mV. The published rows are pooled over all outputs of the test part.
 
-![Spectra of the motion and of what models leave of it](images/mirror_residual.png)
+![Spectra of the motion and of the errors](images/mirror_residual.png)
 
-*Spectra of the outputs held out, of the errors of the linear model and of the model that is named,
-and of the noise between periods; each is the rms in bands of 25 Hz, in % of rms(y).*
+*Spectra of the outputs held out, of the errors of two models, and of the noise between periods:
+rms in bands of 25 Hz, in % of rms(y).*
 
 Share of the error by frequency, in % of rms(y), held out, 100 / 200 / 300 mV:
 
@@ -114,19 +112,18 @@ Nine signals z act back on the mechanics as voltages would:
 - three **soften** the stage: p = z (s - 1), where s is the rms of the three, followed with a time
   constant of {memory:.0f} samples ({memory_ms:.0f} ms); they begin as the extension of the
   actuators, G(0)^-1 y;
-- three are sums of **plays** of five shared thresholds, of what begins as the extension too;
-- three are sums of plays of what begins as the voltages.
+- three are sums of **plays** of five shared thresholds, beginning from the extension too;
+- three are sums of plays, beginning from the voltages.
 
-What they end as, mixtures of motion and voltage, was fitted with all else by the error in free
-run, {parameters} numbers in all. Piezo ceramics do this: domain walls make the material softer and
-lossier the more it is driven, and a resonance is where stress drives it most. What the data show
-is the effect, not its cause: a joint that slips would look alike.
+The fit by the error in free run ends at mixtures of motion and voltage, {parameters} numbers in
+all. Piezo ceramics soften and lose more energy the more they are driven. The data show the effect
+and not its cause: a joint that slips would look alike.
 
 The model is stable at each level between {low:.2f} and {high:.2f}, the plays at rest; beyond them
 the softening stays.
 
-Does the stiffness follow the instant, or the level? The softening alone, refitted
-from the last row with other time constants:
+The time constant tells whether the stiffness follows the instant or the level. The softening alone,
+refitted with other time constants:
 
 | time constant / samples | 100 mV | 200 mV | 300 mV |
 |---|---|---|---|
@@ -137,29 +134,26 @@ from the last row with other time constants:
 ![Frequency and damping of modes against the voltage](images/mirror_modes.png)
 
 *Modes that stand alone, from a modal model refined at each amplitude: dots for the measured
-records, lines for those that the model named above answers to the same voltages.*
+records, lines for the answers of the named model.*
 
 | mode / Hz | frequency at 100 / 200 / 300 mV | of the model | damping in % | of the model |
 |---|---|---|---|---|
 {modes}
 
-Frequencies fall nearly in proportion to the amplitude, as Rayleigh's law of small loops has it,
-not to its square; the damping of some modes rises. One linear model cannot have that.
+Frequencies fall nearly in proportion to the amplitude, as by Rayleigh's law of small loops; the
+damping of some modes rises.
 
 ## Records that do not repeat
 
 {periodicity}
 
-All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods. What fails the test
-is weighted down in the fit by itself.
+All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods.
 
 ## What is left
 
-Noise is {noise} % of rms(y) in one period at 100 / 200 / 300 mV. What lies between it and the
-errors above repeats from period to period, grows nearly in proportion to the amplitude, and is no
-candidate of this page: below 400 Hz and above 3 kHz, where nothing was driven, none of them lowers
-the error of a linear model. All lines up to 3 kHz are driven, so lines do not tell odd
-distortion from even.
+Noise is {noise} % of rms(y) in one period at 100 / 200 / 300 mV. The rest of the error repeats
+from period to period and grows nearly in proportion to the amplitude. No candidate of this page
+lowers it below 400 Hz and above 3 kHz.
 """
 
 
