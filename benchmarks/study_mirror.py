@@ -122,8 +122,8 @@ and not its cause: a joint that slips would look alike.
 The model is stable at each level between {low:.2f} and {high:.2f}, the plays at rest; beyond them
 the softening stays.
 
-The time constant tells whether the stiffness follows the instant or the level. The softening alone,
-refitted with other time constants:
+The time constant tells whether the stiffness follows the instant or the level. The softening
+alone, refitted with other time constants:
 
 | time constant / samples | 100 mV | 200 mV | 300 mV |
 |---|---|---|---|

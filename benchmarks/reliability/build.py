@@ -62,7 +62,8 @@ failure only a watchdog in the amplifier helps ([My driver](driver.md)).
 
 A file that the reader of its library refuses ends in one line that names the file. SciPy reads
 MATLAB files in a process of its own, since some damage ends the process. An effect plug-in that
-cannot be imported is skipped with a warning. [Security](SECURITY.md) lists the threats that remain.
+cannot be imported is skipped with a warning. [Security](SECURITY.md) lists the threats that
+remain.
 
 An output is written under the name `.NAME.RANDOM.tmp` in the same folder (`.new.RANDOM.tmp` in a
 report folder) and renamed when it is whole. A process that is killed leaves such a file, which can
