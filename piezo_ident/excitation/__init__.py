@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What drives the stage: signals, and programs made of them."""
+"""Make input signals for a stage, and programs of such signals."""

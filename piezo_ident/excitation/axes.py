@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One program for several axes: the same segments, and random signals of each axis's own."""
+"""Build one program for several axes: the same segments, with random signals for each axis."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def build_axes(
     limits: tuple[float, float] | None = None,
 ) -> tuple[Sequence, ...]:
     """
-    Return one sequence for each of several axes, with the same segments at the same samples.
+    Build one sequence for each of several axes, with the same segments at the same samples.
 
-    Noise and multisines of each axis are drawn for it alone, so they tell which voltage moved
-    what.  Of one axis the sequence is that of `Program.build`, whose limits and errors hold here
-    too.
+    Each axis has noise and multisines of its own, so the record tells which voltage moved which
+    axis.  For a single axis the result equals `Program.build`.  Limits and errors are those of
+    `Program.build`.
 
     >>> import piezo_ident as pi
     >>> first, second = build_axes(pi.Program.load('two_axes'), 2)
@@ -38,13 +38,13 @@ def build_axes(
         raise ConfigError(
             f'{program.name}: one axis needs a ramp where another needs none; move the bias'
         )
-    # a ramp to where a random signal begins takes each axis its own time
+    # the ramp to the first value of a random signal has another length on each axis
     lengths = [max(s.n for s in same) for same in zip(*(q.segments for q in built), strict=True)]
     return tuple(_stretched(sequence, lengths) for sequence in built)
 
 
 def _stretched(sequence: Sequence, lengths: Iterable[int]) -> Sequence:
-    """Return a sequence whose segments end with their last voltage until they have a length."""
+    """Lengthen the segments of a sequence by their last voltage."""
     parts, segments, n = [], [], 0
     for s, length in zip(sequence.segments, lengths, strict=True):
         parts.append(np.pad(sequence.v[s.start : s.stop], (0, length - s.n), mode='edge'))

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The catalogue of signals: their names in a program, their options, and how they are made."""
+"""Catalogue of signals: their names in a program, their options, and their makers."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation import signals as excitation
 
-#: default of an option that must be given
+#: default of an option that the user must set
 REQUIRED = object()
 
 
 @dataclass(frozen=True)
 class Option:
     """
-    One option of a signal and the values it may take.
+    Option of a signal and its allowed values.
 
     Attributes
     ----------
     unit : str
     default : object
-        `REQUIRED` without one, None for an option that may be absent.
+        `REQUIRED` if the option must be set, None if it may be absent.
     many : bool
-        Whether a list of numbers is expected; one number stands for a list of one.
+        Whether a list of numbers is expected; a single number stands for a list of one.
     whole : bool
         Whether the numbers must be whole and at least one.
     positive : bool
         Whether the numbers must be greater than zero.
     choices : tuple of str
-        Words to choose from; the option is then no number.
+        Words to choose from; the option is then a word.
     """
 
     unit: str
@@ -49,12 +49,12 @@ class Option:
 
     def read(self, value: Any) -> Any:
         """
-        Return the checked value.
+        Check a value and convert it.
 
         Raises
         ------
         ConfigError
-            When it is of another type, not finite, or out of range.
+            If the value is of another type, not finite, or out of range.
         """
         if self.choices:
             if value not in self.choices:
@@ -68,7 +68,7 @@ class Option:
         return self._number(value)
 
     def _number(self, value: Any) -> float | int:
-        # YAML 1.1 reads 2e-5 as text; people write it all the same
+        # YAML 1.1 reads 2e-5 as text, but people write it
         try:
             number = math.nan if isinstance(value, bool) else float(value)
         except (TypeError, ValueError, OverflowError):
@@ -85,9 +85,9 @@ class Option:
 @dataclass(frozen=True)
 class Setting:
     """
-    What every signal may need to know: the rate [Hz], limits and rest [V], chance, and the unit.
+    Context of a signal: sampling rate [Hz], limits and rest [V], random generator, and unit.
 
-    Where the unit is another one, so are the levels; it stands in the names of segments.
+    Levels are in `unit`, which also appears in the names of segments.
     """
 
     sample_rate: float
@@ -100,10 +100,10 @@ class Setting:
 @dataclass(frozen=True, eq=False)
 class Part:
     """
-    A piece of a program that is played without a ramp inside: its voltage v [V], shape (n,).
+    Part of a program without a ramp inside: its voltage v [V], shape (n,).
 
-    `end` is the level at which the signal would go on after its last sample [V]; `name` tells it
-    from others of its kind, and may be empty.
+    `end` is the level at which the signal would continue after its last sample [V].  `name`
+    distinguishes parts of the same kind, and may be empty.
     """
 
     v: Array
@@ -116,14 +116,14 @@ Maker = Callable[[Setting, Mapping[str, Any]], list[Part]]
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal of the catalogue: the kind of its segments, its options and its maker."""
+    """Signal of the catalogue: the kind of its segments, its options and its maker."""
 
     kind: str
     options: Mapping[str, Option]
     make: Maker
 
 
-#: every signal that a program may use
+#: all signals that a program may use
 SIGNALS: dict[str, Signal] = {}
 
 _LEVEL = Option('V')
@@ -135,7 +135,7 @@ _COUNT = Option('1', whole=True)
 
 
 def _signal(name: str, kind: str = '', **options: Option) -> Callable[[Maker], Maker]:
-    """Enter a maker into the catalogue; `kind` is the name by default."""
+    """Enter a maker into the catalogue; by default `kind` is the name."""
 
     def enter(make: Maker) -> Maker:
         SIGNALS[name] = Signal(kind or name, options, make)
@@ -161,7 +161,7 @@ def _hold(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 
 @_signal('step', bias=_LEVEL, size=_SIZE, hold=_TIME, count=_COUNT)
 def _step(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    # before as many levels are listed
+    # check the length before the levels are listed
     n = excitation.sample_count(o['hold'], s.sample_rate)
     excitation.sample_count(n * (o['count'] + 1) / s.sample_rate, s.sample_rate)
     levels = [o['bias'] + (k % 2 - 0.5) * o['size'] for k in range(o['count'] + 1)]
@@ -202,7 +202,7 @@ def _settle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     crest=Option('1', default=2.5, positive=True),
 )
 def _noise(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    # the noise fades to its bias, which is where it goes on
+    # the noise fades to its bias, where it continues
     return [Part(excitation.noise(**o, sample_rate=s.sample_rate, rng=s.rng), o['bias'])]
 
 
@@ -226,14 +226,14 @@ def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
         name = 'paper'
     else:
         base = low if o['base'] is None else o['base']
-        # the last peak reaches the end of the range, or thresholds up there stay unexcited
+        # the last peak reaches the end of the range, so that every threshold is excited
         peaks = o['peaks'] or (low + (high - low) / 3, low + 2 * (high - low) / 3, high)
         slope, name = o['slope'], ''
     return _periodic(excitation.triangle(peaks, base, slope, s.sample_rate), name)
 
 
 def _about(bias: float, sizes: Iterable[float]) -> list[float]:
-    """Return corners on both sides of a bias in turn, from it and back to it."""
+    """List corners on both sides of a bias in turn, starting and ending at the bias."""
     return [bias, *(x for a in sizes for x in (bias + a, bias - a)), bias]
 
 
@@ -241,7 +241,7 @@ def _about(bias: float, sizes: Iterable[float]) -> list[float]:
     'decaying_triangle', 'triangle', bias=_LEVEL, amplitude=_SIZE, cycles=_COUNT, slope=_SLOPE
 )
 def _decaying_triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
-    # before as many corners are listed; each leg has a sample
+    # check the length before the corners are listed; each leg has at least one sample
     excitation.sample_count(2 * o['cycles'] / s.sample_rate, s.sample_rate)
     sizes = (o['amplitude'] * (1.0 - k / o['cycles']) for k in range(o['cycles']))
     levels = _about(o['bias'], sizes)
@@ -283,7 +283,7 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     f = o['frequency']
     if (o['periods'] is None) == (o['duration'] is None):
         raise ConfigError('give either periods or duration')
-    # rounded first: 1.4 s of 10 Hz are 14 periods, not 15
+    # rounded first, so that 1.4 s of 10 Hz are 14 periods, not 15
     if o['duration']:
         excitation.sample_count(o['duration'], s.sample_rate)
     periods = o['periods'] or math.ceil(round(o['duration'] * f, 6))
@@ -304,7 +304,7 @@ def _sine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 )
 def _multisine(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     period, count = o['period'], o['realisations']
-    # all of it, before any is made
+    # check the length of all realisations before any is made
     excitation.sample_count(period * o['periods'] * count, s.sample_rate)
     for end in ('lowest', 'highest'):
         if o[end] > s.sample_rate / 2:

@@ -5,7 +5,7 @@
 Programs: named input signals in a row, with soft ramps between them, written as YAML.
 
     limits: [0, 10]          # V; no sample may leave them
-    sample_rate: 20000       # Hz; the caller's when absent
+    sample_rate: 20000       # Hz; by default the rate of the caller
     seed: 1
     segments:
       - {signal: idle, duration: 0.3}
@@ -46,7 +46,7 @@ _NAME = re.compile(r'[\w.+-]+')
 @dataclass(frozen=True, eq=False)
 class Sequence:
     """
-    The command voltage v [V] of a whole program, shape (n,), sampled at a rate [Hz].
+    Command voltage v [V] of a whole program, shape (n,), at its sampling rate [Hz].
 
     The segments cover every sample, and no two neighbours share a label.
     """
@@ -75,8 +75,8 @@ class Sequence:
         return np.arange(self.n) / self.sample_rate
 
     def describe(self) -> str:
-        """Return one line a segment: start, length, label and voltages."""
-        # times tell the sample, for labels of a record that was measured
+        """Write one line for each segment: start, length, label and voltages."""
+        # the digits resolve a sample, so that the times can label a measured record
         rate, digits = self.sample_rate, max(3, math.ceil(math.log10(self.sample_rate)))
         return '\n'.join(
             f'{s.start / rate:{digits + 6}.{digits}f} s {s.n / rate:{digits + 6}.{digits}f} s  '
@@ -88,7 +88,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Entry:
-    """One item of a program: a signal with its options, perhaps under a name of its own."""
+    """Item of a program: a signal with its options, and optionally a name of its own."""
 
     signal: str
     options: Mapping[str, Any]
@@ -98,7 +98,7 @@ class Entry:
 @dataclass(frozen=True)
 class Program:
     """
-    A checked program.
+    Checked program.
 
     Attributes
     ----------
@@ -108,15 +108,15 @@ class Program:
     limits : tuple of float
         Lowest and highest voltage [V].
     sample_rate : float or None
-        [Hz]; None leaves it to the caller.
+        Sampling rate [Hz]; with None the caller chooses it.
     seed : int
-        Of the random signals.
+        Seed of the random signals.
     rest : float
-        Voltage before and after [V].
+        Voltage before and after the program [V].
     slew : float
         Largest speed of the ramps [V/s].
     unit : str
-        What its levels are in, of a program that is no voltage; it stands in labels.
+        Unit of the levels, V for a voltage; it appears in labels.
 
     Examples
     --------
@@ -139,12 +139,12 @@ class Program:
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> Program:
         """
-        Read a program: ``identification`` or another that is shipped, or a file of one's own.
+        Read a program that is shipped, such as ``identification``, or a file of the user.
 
         Raises
         ------
         ConfigError
-            When the file cannot be read, or as `parse_program` says.
+            If the file cannot be read, and in the cases of `parse_program`.
 
         Examples
         --------
@@ -162,21 +162,21 @@ class Program:
         limits: tuple[float, float] | None = None,
     ) -> Sequence:
         """
-        Return the voltage of the program, from rest to rest.
+        Build the voltage of the program, from rest to rest.
 
         Parameters
         ----------
         sample_rate : float, optional
-            [Hz]; needed when the program names none, and wins over it.
+            Sampling rate [Hz]; required if the program has none, and used instead of its rate.
         rng : numpy.random.Generator, optional
-            For the random signals; one from the program's seed when absent.
+            Generator of the random signals; by default one with the seed of the program.
         limits : tuple of float, optional
-            Further limits, say of the amplifier [V]; the narrower hold.
+            Further limits, for example of the amplifier [V]; the narrower limits hold.
 
         Raises
         ------
         ConfigError
-            When a sample leaves the limits, or a signal cannot be made at this rate.
+            If a sample leaves the limits, or a signal cannot be made at this rate.
         """
         rate = self.sample_rate if sample_rate is None else float(sample_rate)
         if rate is None or not (math.isfinite(rate) and rate > 0):
@@ -211,7 +211,7 @@ class Program:
         labelled = []
         for part in parts:
             least, most = float(part.v.min()), float(part.v.max())
-            # a sample that is no number passes no comparison
+            # written so that NaN fails, too
             if not (low - slack <= least and most <= high + slack):
                 raise ConfigError(
                     f'{where}: reaches {least:g} .. {most:g} V, outside the limits '
@@ -221,7 +221,7 @@ class Program:
             if part.name and (not name or len(parts) > 1):
                 name = f'{name}-{part.name}' if name else part.name
             label = f'{signal.kind}:{name}' if name else signal.kind
-            # what is cut off here is rounding, not signal
+            # clipping here only removes rounding
             labelled.append((label, replace(part, v=np.clip(part.v, low, high))))
         return labelled
 
@@ -254,7 +254,7 @@ class Program:
             append(label, part.v)
             level = min(max(part.end, low), high)
         go_to(self.rest)
-        # a last sample at rest, so that the rest voltage is what is held
+        # the last sample is at rest, so that the output holds the rest voltage
         if segments[-1].kind == 'ramp':
             pieces.append(np.array([self.rest]))
             segments[-1] = replace(segments[-1], stop=n + 1)
@@ -267,9 +267,9 @@ def _where(name: str, number: int, signal: object) -> str:
 
 def parse_program(text: str, name: str = 'program') -> Program:
     """
-    Read a program from YAML; `name` is what messages call it.
+    Read a program from YAML; messages contain its `name`.
 
-    ConfigError when a key is unknown, missing, of the wrong type or out of range.
+    Raises ConfigError if a key is unknown, missing, of the wrong type or out of range.
 
     >>> program = parse_program('''
     ... limits: [0, 10]

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A program for a stage of another voltage range and another sampling rate, also as text."""
+"""Scale a program to another voltage range and another sampling rate, and write it as text."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ HIGHEST = 0.4
 
 def scaled(program: Program, limits: tuple[float, float], sample_rate: float) -> Program:
     """
-    Return a program between other limits [V], for another sampling rate [Hz], as long as before.
+    Scale a program to other limits [V] and another sampling rate [Hz]; its duration stays.
 
-    Levels are shifted and scaled, sizes and speeds scaled; frequencies above 0.4 times the
-    sampling rate are lowered to that.  A signal with voltages of its own raises ConfigError.
+    Levels are shifted and scaled, sizes and speeds scaled.  Frequencies above 0.4 times the
+    sampling rate are lowered to it.  Raises ConfigError for a signal with voltages of its own.
 
     >>> import piezo_ident as pi
     >>> v = scaled(pi.Program.load('validation'), (-20, 120), 2000).build().v
@@ -40,7 +40,7 @@ def scaled(program: Program, limits: tuple[float, float], sample_rate: float) ->
             return x
         if option.unit == 'Hz':
             return min(x, HIGHEST * sample_rate)
-        # a size has no zero that could be shifted
+        # a size is a difference of levels, so a shift does not change it
         return factor * x if option.positive else low + factor * (x - lowest)
 
     entries = []
@@ -65,7 +65,7 @@ def scaled(program: Program, limits: tuple[float, float], sample_rate: float) ->
 
 def program_to_yaml(program: Program) -> str:
     """
-    Return the text of a program, which `pi.Program.load` reads from a file.
+    Write the text of a program, which `pi.Program.load` reads from a file.
 
     Examples
     --------

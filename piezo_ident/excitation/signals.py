@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The input signals, each a vector of volts.
+Input signals, each a vector of volts.
 
-Every signal is half-open: its next sample would continue it at its first value again (a staircase
-at its last), so that signals and the ramps between them follow one another without a repeated
-sample.  Randomness comes only from the generator passed in.
+Every signal is half-open: its first value would follow its last sample (in a staircase, its last
+value).  Signals and the ramps between them therefore join without a repeated sample.  The
+generator in the arguments is the only source of randomness.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 PAPER_PEAKS = (3.0, 6.0, 9.0)
 PAPER_SLOPE = 6.0
 
-#: odd lines of which one is left out
+#: number of neighbouring odd lines of which one is left out
 GROUP = 4
 
 #: longest signal; more would not fit into the memory of a lab computer
@@ -30,7 +30,7 @@ MAX_SAMPLES = 50_000_000
 
 
 def sample_count(seconds: float, sample_rate: float) -> int:
-    """Return how many samples a signal has; ConfigError for less than one, or too many."""
+    """Count the samples of a signal; raises ConfigError for less than one, or too many."""
     n = seconds * sample_rate
     if n < 0.5:
         raise ConfigError(f'{seconds:g} s is shorter than one sample; make it longer')
@@ -49,9 +49,9 @@ def _below_nyquist(frequency: float, sample_rate: float) -> None:
 
 def ramp(start: float, stop: float, slew: float, sample_rate: float) -> Array:
     """
-    Return a soft way from one level to another [V]; `stop` is the sample after the last.
+    Make a smooth ramp from one level to another [V]; `stop` would be the next sample.
 
-    The speed is a raised cosine, so it starts and ends at zero; its largest value is `slew` [V/s].
+    The speed is a raised cosine.  It starts and ends at zero; its largest value is `slew` [V/s].
     """
     seconds = max(1.0 / sample_rate, 2.0 * abs(stop - start) / slew)
     sample_count(seconds, sample_rate)
@@ -61,7 +61,7 @@ def ramp(start: float, stop: float, slew: float, sample_rate: float) -> Array:
 
 
 def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> Array:
-    """Return levels [V] that are jumped to, each held for its time [s]."""
+    """Make a staircase of levels [V], each held for its time [s]."""
     n = [sample_count(t, sample_rate) for t in hold]
     sample_count(sum(n) / sample_rate, sample_rate)
     return np.repeat(np.asarray(levels, dtype=np.float64), n)
@@ -69,10 +69,10 @@ def staircase(levels: Many[float], hold: Many[float], sample_rate: float) -> Arr
 
 def corners(levels: Many[float], slope: float, sample_rate: float) -> Array:
     """
-    Return straight lines through levels [V], all with the same magnitude of slope [V/s].
+    Make straight lines through levels [V], all with the same magnitude of slope [V/s].
 
-    Every leg takes a whole number of samples, so that each corner is met exactly; the slope is
-    met within that rounding.
+    Every line takes a whole number of samples, so that each corner is met exactly.  The slope is
+    met within this rounding.
     """
     v = np.asarray(levels, dtype=np.float64)
     seconds = np.abs(np.diff(v)) / slope
@@ -84,7 +84,7 @@ def corners(levels: Many[float], slope: float, sample_rate: float) -> Array:
 
 def triangle(peaks: Many[float], base: float, slope: float, sample_rate: float) -> Array:
     """
-    Return triangles from a base to each of the peaks and back.
+    Make triangles from a base to each of the peaks and back.
 
     Examples
     --------
@@ -103,10 +103,10 @@ def settling_sweep(
     bias: float, amplitude: float, cycles: int, frequency: float, sample_rate: float
 ) -> Array:
     """
-    Return sine cycles about a bias that die out linearly after a full first one.
+    Make sine cycles around a bias, which decay linearly after a full first cycle.
 
-    Every play narrower than the sweep is left in the middle of its band, every wider one at rest:
-    noise a little smaller than the sweep then moves neither towards new extremes.
+    The sweep leaves every narrower play in the middle of its band, and every wider play at rest.
+    Noise slightly smaller than the sweep then moves neither kind of play to new extremes.
     """
     _below_nyquist(frequency, sample_rate)
     n = sample_count(cycles / frequency, sample_rate)
@@ -124,9 +124,9 @@ def sine(
     phase: float = 0.0,
 ) -> Array:
     """
-    Return a whole number of periods of ``bias + amplitude sin(2 pi f t + phase)``.
+    Make a whole number of periods of ``bias + amplitude sin(2 pi f t + phase)``.
 
-    The length is rounded to a sample where the periods do not fall on one.
+    The length is rounded to a whole number of samples.
     """
     _below_nyquist(frequency, sample_rate)
     n = sample_count(periods / frequency, sample_rate)
@@ -145,23 +145,23 @@ def noise(
     fade: float = 0.01,
 ) -> Array:
     """
-    Return Gaussian noise with a flat spectrum up to a cut-off and limited peaks.
+    Make Gaussian noise with a flat spectrum up to a cut-off and limited peaks.
 
-    Clipping lowers the peaks and widens the spectrum, filtering restores the spectrum and raises
-    the peaks a little: repeated in turn, both settle.
+    Clipping lowers the peaks and widens the spectrum.  Filtering restores the spectrum and
+    slightly raises the peaks.  In turn, both converge.
 
     Parameters
     ----------
     bias, amplitude : float
         Mean and largest deviation from it [V].
     cutoff : float
-        End of the flat band [Hz]; a raised cosine leads to nothing at 1.2 times this frequency.
+        End of the flat band [Hz]; a raised cosine falls to zero at 1.2 times this frequency.
     duration, sample_rate : float
-        [s], [Hz]
+        Length [s] and sampling rate [Hz].
     rng : numpy.random.Generator
         Draws the noise.
     crest : float, optional
-        Crest factor that is aimed at; about 2 is the least that can be reached.
+        Wanted crest factor; about 2 is the smallest possible value.
     fade : float, optional
         Time in which the noise rises from the bias and falls back to it [s].
     """
@@ -191,9 +191,9 @@ def noise(
 
 def odd_lines(lowest: int, highest: int, rng: np.random.Generator) -> Integers:
     """
-    Return odd harmonic numbers, with one of every `GROUP` left out at random.
+    Choose odd harmonic numbers, with one of every `GROUP` left out at random.
 
-    Odd and even lines that are not excited detect odd and even nonlinearity: the random-odd
+    The missing odd and even lines detect odd and even nonlinearity: this is the random-odd
     multisine of Pintelon and Schoukens, System Identification, 2nd ed., Wiley 2012.
     """
     odd = np.arange(lowest | 1, highest + 1, 2)
@@ -213,7 +213,7 @@ def multisine(
     rng: np.random.Generator,
 ) -> Array:
     """
-    Return whole periods of a random-phase multisine with equal lines.
+    Make whole periods of a random-phase multisine with equal lines.
 
     Parameters
     ----------
@@ -222,9 +222,9 @@ def multisine(
     lines : ndarray of int
         Harmonic numbers of ``1 / period``; see `odd_lines`.
     period, periods : float, int
-        Its length, rounded to a sample [s], and how often it is repeated.
+        Length of a period, rounded to a sample [s], and number of periods.
     sample_rate : float
-        [Hz]
+        Sampling rate [Hz].
     rng : numpy.random.Generator
         Draws the phases.
     """

@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Many records: each on its own, in parallel, with a table of them all."""
+"""Process many records, each on its own and in parallel, and collect them in a table."""

@@ -4,8 +4,8 @@
 """
 Figures of merit of a stage: a few numbers that can be compared between stages.
 
-The coefficients of G cannot be compared, since two identifications of one stage may choose
-different orders.  These numbers are read from the response of H and of G.
+The coefficients of G cannot be compared, since two identifications of the same stage may choose
+different orders.  The figures are read from the responses of H and of G.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from piezo_ident.model.stage_model import StageModel
 
-#: samples of one branch of the loop, and frequencies at which G is evaluated
+#: number of samples of a branch of the loop, and of frequencies at which G is evaluated
 BRANCH, FREQUENCIES = 400, 4000
-#: lowest of them, as a share of the highest
+#: lowest of these frequencies, as a share of the highest
 LOWEST = 1e-4
 #: |G| from which a maximum counts as a resonance
 PEAK = 1.05
@@ -23,11 +23,12 @@ PEAK = 1.05
 
 def figures_of_merit(model: StageModel) -> dict[str, float | None]:
     """
-    Return the figures of merit of a stage by the columns of `piezo_ident.many.table`.
+    Compute the figures of merit of a stage, by the columns of `piezo_ident.many.table`.
 
-    The gain [m/V] is negative for a stage that retracts; the loop width is in % of the stroke over
-    the identified range.  The bandwidth, down to 1/sqrt(2), is None when |G| never falls so far;
-    the resonance, the frequency of the largest |G|, and its peak are None without one.
+    The gain [m/V] is negative for a stage that retracts.  The loop width is in % of the stroke
+    over the identified range.  The bandwidth [Hz] is the frequency at which |G| falls to
+    1/sqrt(2); it is None if |G| never falls so far.  The resonance [Hz] is the frequency of the
+    largest |G|; the resonance and its peak are None without a peak.
 
     Examples
     --------
@@ -48,7 +49,7 @@ def _loop(model: StageModel) -> tuple[float, float]:
     low, high = model.scaling.range
     first, last = model.scaling.u(np.array([low, high]))
     up = np.linspace(first, last, BRANCH)
-    # the first rise is the virgin curve; from there on the loop repeats
+    # the first rise is the virgin curve; the loop repeats from there on
     w = model.hysteresis(np.concatenate([up, up[-2::-1], up[1:]]))
     down, again = w[BRANCH - 1 : 2 * BRANCH - 1][::-1], w[2 * BRANCH - 2 :]
     span = float(again[-1] - again[0])
@@ -70,7 +71,7 @@ def _frequency_response(model: StageModel) -> tuple[float | None, float | None, 
     bandwidth = None
     if low.size and low[0] > 0:
         k = int(low[0])
-        # between two neighbours |G| is as good as a straight line
+        # |G| is nearly a straight line between neighbouring frequencies
         bandwidth = float(np.interp(-np.sqrt(0.5), -size[[k - 1, k]], f[[k - 1, k]]))
     k = int(np.argmax(size))
     if size[k] < PEAK or k in (0, f.size - 1):

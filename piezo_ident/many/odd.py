@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which records of many stand out, and in what."""
+"""Find records that stand out among many, and the columns in which they do."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ import statistics
 
 from piezo_ident.many.table import Row
 
-#: fewer values than these say little about how far others of the kind lie apart
+#: smallest number of values that tells how far apart the values of a column usually lie
 FEWEST = 8
-#: distance from the median that stands out: in standard deviations, as the median of the distances
-#: gives them, and at least this share of the median
+#: distance from the median that stands out, in standard deviations (estimated by the median of the
+#: distances), and its smallest value as a share of the median
 FAR, SHARE = 5.0, 0.02
-#: a delay is a number of samples, and may come out as the next one
+#: distance of a delay that stands out [samples]: a whole number may come out as its neighbour
 SAMPLES = 1.5
-#: what is compared; errors and noise by their logarithm, and only above the others
+#: columns that are compared by value, and columns that are compared by logarithm and stand out
+#: only above the median (errors and noise)
 COMPARED = (
     *('sample_rate', 'duration', 'voltage_high', 'stroke', 'gain', 'loop_width'),
     *('delay_samples', 'bandwidth', 'resonance'),
@@ -27,13 +28,13 @@ ABOVE = (
     *('error_held_out', 'error_fitted', 'error_before', 'error_after', 'unexplained'),
     'noise_floor',
 )
-#: an error that stands out is so many times that of the others at least
+#: smallest ratio of an error that stands out to the median
 TIMES = 1.25
 
 
 def stand_out(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """
-    Return for each record that stands out the columns in which it does, with the medians of all.
+    Find the records that stand out, with the columns in which they do and the medians of these.
 
     Examples
     --------
@@ -56,7 +57,8 @@ def stand_out(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         least = SHARE * abs(middle) if column in COMPARED else math.log(TIMES)
         if column == 'delay_samples':
             least = SAMPLES
-        # 1.4826: the standard deviation of normal numbers over the median of their distances
+        # 1.4826: ratio of the standard deviation of normal numbers to the median of their
+        # distances
         spread = 1.4826 * statistics.median(abs(x - middle) for x in scaled.values())
         for name, x in scaled.items():
             away = abs(x - middle) if column in COMPARED else x - middle

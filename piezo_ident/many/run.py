@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Many records: each is identified or diagnosed on its own, in a process of its own.
+Identify or diagnose many records, each on its own and in a process of its own.
 
-The worker that reads a record also writes its results, so that workers on other machines need
-nothing but the same folders.  A record that fails is a row with a reason; it stops no other.
+The worker that reads a record also writes its results, so that workers on other machines only need
+the same folders.  A record that fails becomes a row with a reason, and the others go on.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ MARK = 'many.json'
 
 @dataclass(frozen=True)
 class Identify:
-    """Identification of one record: `Settings`, and `ReadOptions`."""
+    """Task of identifying one record, by `Settings` and `ReadOptions`."""
 
     settings: Settings = field(default_factory=Settings)
     reading: ReadOptions = field(default_factory=ReadOptions)
     verb = 'identify'
 
     def __call__(self, record: Record, name: str) -> tuple[Identification, dict[str, Value]]:
-        """Return the result and the cells of its row."""
+        """Identify a record; the result and the cells of its row."""
         result = identify(record, self.settings)
         return result, identified(result, record)
 
@@ -53,7 +53,7 @@ class Identify:
 @dataclass(frozen=True)
 class Diagnose:
     """
-    Diagnosis of one record.
+    Task of diagnosing one record.
 
     `models` is a model file for all records, or a folder with ``NAME.yaml`` for each, such as the
     folder that an identification of many records wrote.
@@ -65,14 +65,14 @@ class Diagnose:
     verb = 'diagnose'
 
     def model_of(self, name: str) -> Path:
-        """Return the model file of a record."""
+        """Find the model file of a record."""
         if not self.models.is_dir():
             return self.models
         inside = self.models / 'models'
         return (inside if inside.is_dir() else self.models) / f'{name}.yaml'
 
     def __call__(self, record: Record, name: str) -> tuple[Diagnosis, dict[str, Value]]:
-        """Return the result and the cells of its row."""
+        """Diagnose a record; the result and the cells of its row."""
         given = self.model_of(name)
         result = diagnose(load(given), record, self.settings)
         return result, {'model': given.name, **diagnosed(result, record)}
@@ -83,7 +83,7 @@ Task = Identify | Diagnose
 
 @dataclass(frozen=True)
 class _Job:
-    """One record: called in the worker, it returns a row and never raises."""
+    """Job for one record; a call in the worker gives a row and never raises."""
 
     task: Task
     path: Path
@@ -104,15 +104,16 @@ class _Job:
         return self.folder / 'reports' / self.name
 
     def settings(self) -> dict[str, Any]:
-        """Return what the result depends on, apart from the record itself."""
+        """Collect everything that the result depends on, except the record itself."""
         task = json.loads(json.dumps(asdict(self.task), default=str))
         return {'version': __version__, 'path': str(self.path), 'report': self.report, **task}
 
     def inputs(self) -> list[list[int | str]]:
         """
-        Return name, size and time of the files that are read.
+        List name, size and time of the input files.
 
-        Not whether they are older than the results: a file that takes the place of another may be.
+        A comparison with the time of the results would not do: a file that replaces another may
+        be older than the results.
         """
         files = [self.path, *sorted(self.path.iterdir() if self.path.is_dir() else ())]
         if isinstance(self.task, Diagnose):
@@ -120,7 +121,7 @@ class _Job:
         return [[f.name, (at := f.stat()).st_size, at.st_mtime_ns] for f in files]
 
     def earlier(self) -> Row | None:
-        """Return the row of an earlier run, None where the record has to be done again."""
+        """Read the row of an earlier run; None if the record must be processed again."""
         try:
             kept = json.loads(self.row_file.read_text(encoding='utf-8'))
             same = kept['inputs'] == self.inputs() and kept['settings'] == self.settings()
@@ -134,7 +135,7 @@ class _Job:
     def __call__(self, tick: Tick = lambda step, share: None) -> Row:
         self.row_file.unlink(missing_ok=True)
         try:
-            # before they are read: what changes meanwhile is done again
+            # before the files are read, so that a file that changes meanwhile is read again
             inputs = self.inputs()
             result, values = self.task(record_io.read(self.path, self.task.reading), self.name)
             result.model.save(self.model_file)
@@ -144,7 +145,7 @@ class _Job:
                 write_report(result, self.report_folder)
             kept = {'settings': self.settings(), 'inputs': inputs, 'values': values}
             write_text(self.row_file, json.dumps(kept))
-        # one record must not end the run, whatever goes wrong with it
+        # no error of a record may end the run
         except Exception as error:  # noqa: BLE001
             self.model_file.unlink(missing_ok=True)
             return self.failed(error)
@@ -175,37 +176,39 @@ def run_many(
     """
     Identify or diagnose every record on its own.
 
-    A record whose results are in `folder` already, made of the same file with the same settings,
-    is not done again: a run that was stopped goes on with the same call.
+    A record is skipped if `folder` holds its results from the same file with the same settings.
+    The same call therefore continues a run that was stopped.
 
     Parameters
     ----------
     records : sequence of path
         Files and bags with different names.
     folder : path
-        Gets ``models/NAME.yaml``, ``rows/NAME.json`` and, with `reports`, ``reports/NAME/``.
+        Folder for ``models/NAME.yaml``, ``rows/NAME.json`` and, with `reports`,
+        ``reports/NAME/``.
     task : Identify or Diagnose
     reports : bool, optional
-        Write a report of every record.
+        Whether to write a report of every record.
     jobs : int, optional
-        Number of processes; one a core when absent.
+        Number of processes; by default one for each core.
     scheduler : str, optional
         Address of a dask scheduler whose workers see the same paths; `jobs` is then not used.
     progress : callable, optional
-        Called with the number of records done and of all, and the row that is new, if any.
+        Called with the number of finished records, the number of all records, and the new row,
+        if any.
 
     Returns
     -------
     list of Row
-        In the order of the names, numbers by value.
+        Rows sorted by record name, with numbers by value.
 
     Raises
     ------
     ConfigError
-        When two records have one name, `folder` holds something else, an input lies in `folder`,
+        If two records have the same name, `folder` holds other files, an input lies in `folder`,
         or no scheduler answers.
     DataError
-        When `folder` cannot be written.
+        If `folder` cannot be written.
     """
     work = _prepare(records, folder, task, reports)
     rows = {job.name: row for job in work if (row := job.earlier()) is not None}
@@ -260,7 +263,7 @@ def _mark(path: Path) -> object:
 
 
 def _cores() -> int:
-    # what a container or a batch system leaves us, where that can be known
+    # cores that a container or a batch system leaves to this process, if the system tells them
     if hasattr(os, 'sched_getaffinity'):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The table of many records: one row a record, written as CSV."""
+"""Table of many records: one row for each record, written as CSV."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Value = str | float | int | None
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: its values by column, or in one line why the record failed."""
+    """Row of the table: its values by column, or the reason in one line if the record failed."""
 
     record: str
     values: Mapping[str, Value] = field(default_factory=dict)
@@ -33,12 +33,12 @@ class Row:
 
     @property
     def is_good(self) -> bool:
-        """Whether the record carried a result."""
+        """Whether the record gave a result."""
         return not self.reason
 
 
-#: units of the columns that do not depend on what was found, in their order; '' for text and
-#: plain numbers; docs/many_records.md tells what they hold
+#: units of the fixed columns, in their order; '' for text and plain numbers; docs/many_records.md
+#: explains the columns
 COLUMNS = {
     'record': '',
     'status': '',
@@ -80,13 +80,13 @@ COLUMNS = {
 }
 #: units of the first columns of an effect, as ``creep.share``
 FOUND = {'share': '', 'rms': '% of stroke'}
-#: these stand behind whatever was found
+#: columns behind all others
 _LAST = ('faults', 'warnings')
 
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """
-    Return a key that sorts as people do: numbers by value.
+    Make a key that sorts as people do: numbers by value.
 
     Examples
     --------
@@ -94,18 +94,18 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     ['Stage', 'stage_9', 'stage_10']
     """
     parts = re.split(r'(\d+)', text)
-    # the text itself decides between 01 and 1
+    # the text itself decides between equal numbers such as 01 and 1
     key = [(1, int(p), p) if p.isdecimal() else (0, 0, p) for p in parts if p]
     return (*key, (2, 0, text))
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a column; '' for text, plain numbers, and parameters of effects."""
+    """Find the unit of a column; '' for text, plain numbers, and parameters of effects."""
     return COLUMNS.get(column) or FOUND.get(column.partition('.')[2], '')
 
 
 def columns_of(rows: Iterable[Row]) -> list[str]:
-    """Return the columns that these rows need, in the order of the table."""
+    """List the columns that these rows need, in the order of the table."""
     present = {name for row in rows for name in row.values}
     known = [name for name in COLUMNS if name in ('record', 'status', 'reason') or name in present]
     others = sorted(present - set(COLUMNS), key=_place)
@@ -124,9 +124,9 @@ def _place(column: str) -> tuple[Any, ...]:
 
 def csv_text(rows: Sequence[Row]) -> str:
     """
-    Return the table as CSV; a cell without a value is empty.
+    Write the table as CSV; a cell without a value is empty.
 
-    Text that a spreadsheet would run as a formula gets an apostrophe in front.
+    Text that a spreadsheet would run as a formula gets a leading apostrophe.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def csv_text(rows: Sequence[Row]) -> str:
 def _text(value: Value) -> str:
     if isinstance(value, str):
         return f"'{value}" if value.startswith(('=', '+', '-', '@', '\t', '\r')) else value
-    # the shortest text from which the same number is read
+    # the shortest text that gives the same number when it is read
     return '' if value is None else repr(value)
 
 
@@ -171,7 +171,7 @@ def _number(value: float | None) -> float | None:
 
 
 def identified(result: Identification, record: Record) -> dict[str, Value]:
-    """Return the cells of an identification by their columns."""
+    """Collect the cells of an identification by their columns."""
     model = result.model
     h = model.hysteresis
     values: dict[str, Value] = {
@@ -197,7 +197,7 @@ def identified(result: Identification, record: Record) -> dict[str, Value]:
 
 
 def diagnosed(result: Diagnosis, record: Record) -> dict[str, Value]:
-    """Return the cells of a diagnosis, with those of every effect that was added."""
+    """Collect the cells of a diagnosis, including those of every added effect."""
     values: dict[str, Value] = {
         **_head(record),
         'verdict': result.verdict,
@@ -229,5 +229,5 @@ def _cells(column: str, value: float | str | tuple[float, ...]) -> dict[str, Val
 
 
 def _joined(items: Iterable[object]) -> str:
-    # lines would make a table hard to read elsewhere
+    # line breaks in a cell would make the table hard to read in other programs
     return ' | '.join(' '.join(str(x).split()) for x in items)

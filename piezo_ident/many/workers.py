@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Where jobs run: processes of this machine, or the workers of a dask cluster."""
+"""Run jobs in processes of this machine, or on the workers of a dask cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.process import Job, WorkerProcess
 
-#: takes a job, and returns its result to be
+#: function that takes a job and gives the future of its result
 Submit = Callable[[Any], Future[Any]]
 
 WAIT_FOR_SCHEDULER = 10.0
@@ -24,8 +24,9 @@ WAIT_FOR_SCHEDULER = 10.0
 
 @contextmanager
 def processes(jobs: int) -> Iterator[Submit]:
-    """Yield what submits jobs to so many processes; a process that dies costs one job."""
-    # the matrices are narrow: a second thread of BLAS only waits; new processes inherit this
+    """Yield a function that submits jobs to processes; a process that dies costs one job."""
+    # a second thread of BLAS would only wait, as the matrices are narrow; new processes inherit
+    # this
     for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
         os.environ.setdefault(name, '1')
     local, workers = threading.local(), []
@@ -49,17 +50,17 @@ def processes(jobs: int) -> Iterator[Submit]:
         threads.shutdown(wait=False, cancel_futures=True)
         end()
         threads.shutdown()
-        # that of a thread that had only begun
+        # close the process of a thread that had only begun
         end()
 
 
 @contextmanager
 def dask(address: str) -> Iterator[Submit]:
     """
-    Yield what submits jobs to the workers of a dask scheduler.
+    Yield a function that submits jobs to the workers of a dask scheduler.
 
-    ConfigError when dask.distributed is not installed, no scheduler answers, it has no worker, or
-    a worker has another version of this package.
+    Raises ConfigError if dask.distributed is not installed, no scheduler answers, the scheduler
+    has no worker, or a worker has another version of this package.
     """
     try:
         from distributed import Client

@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model of a stage: its file, its free run on a record, and the simulated stage."""
+"""Model of a stage: its file, its free run on a record, and the simulated stage."""

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Model files: one YAML document, read with the safe loader only, written in one piece."""
+"""Read and write model files: YAML documents, read by the safe loader and written atomically."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from piezo_ident.operators.hysteresis import Hysteresis
 import yaml
 
 SCHEMA_VERSION = 1
-#: effects of a model, and coefficients of G, whose roots cost their third power
+#: most effects of a model, and largest order of G (finding its roots costs the third power of it)
 EFFECTS, ORDER = 50, 200
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
@@ -43,7 +43,7 @@ _EFFECT = ('name', 'slot', 'parameters')
 
 
 class _Dumper(yaml.SafeDumper):
-    """Lists of numbers on one line, everything else in blocks."""
+    """YAML writer that puts a list of numbers on one line, and everything else in blocks."""
 
 
 def _represent_list(dumper: yaml.SafeDumper, data: list[Any]) -> yaml.Node:
@@ -55,7 +55,7 @@ _Dumper.add_representer(list, _represent_list)
 
 
 def plain(value: Any) -> Any:
-    """Return nested mappings, sequences and numpy values as plain Python data."""
+    """Convert nested mappings, sequences and numpy values to plain Python data."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray):
@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 
 def finite(value: Any) -> Any:
-    """Return plain data with None for the numbers that JSON cannot hold."""
+    """Replace numbers that JSON cannot hold by None in plain data."""
     if isinstance(value, dict):
         return {key: finite(x) for key, x in value.items()}
     if isinstance(value, list):
@@ -84,7 +84,7 @@ def _part(data: Mapping[str, Any], key: str, name: str) -> Mapping[str, Any]:
 
 
 def number(data: Mapping[str, Any], key: str, name: str, default: float | None = None) -> float:
-    """Return a number of a mapping, or raise ModelError; ``2e-5``, text to YAML 1.1, is one."""
+    """Read a number of a mapping, or raise ModelError; ``2e-5`` counts, though YAML reads text."""
     value = data.get(key, default)
     if isinstance(value, bool) or value is None:
         raise ModelError(f'{name}: {key} is missing or not a number')
@@ -95,7 +95,7 @@ def number(data: Mapping[str, Any], key: str, name: str, default: float | None =
 
 
 def numbers(data: Mapping[str, Any], key: str, name: str) -> np.ndarray[Any, Any]:
-    """Return a list of numbers of a mapping, or raise ModelError."""
+    """Read a list of numbers of a mapping, or raise ModelError."""
     value = data.get(key)
     if not isinstance(value, list) or any(isinstance(x, bool) for x in value):
         raise ModelError(f'{name}: {key} must be a list of numbers')
@@ -116,7 +116,7 @@ def _similar(key: str, known: Iterable[str]) -> str | None:
 
 
 def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name: str) -> None:
-    """Refuse unknown keys with a ModelError, and suggest the known ones that they resemble."""
+    """Refuse unknown keys with a ModelError that suggests similar known keys."""
     unknown = _unknown(data, known)
     if not unknown:
         return
@@ -128,9 +128,10 @@ def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name
 
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     """
-    Build a model from the contents of a model file, whose name serves messages.
+    Build a model from the contents of a model file; messages contain the `name` of the file.
 
-    ModelError when the schema is later than this package knows, or a part is missing or wrong.
+    Raises ModelError if the schema is later than this package knows, or a part is missing or
+    wrong.
     """
     if 'several_axes' in data:
         raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
@@ -146,7 +147,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
         )
     missing = [key for key in _REQUIRED if key not in data]
     known = (*_REQUIRED, *_OPTIONAL)
-    # a missing part may be there with its name misspelt; otherwise it is another kind of file
+    # a missing part may be there under a misspelt name; otherwise the file is of another kind
     if missing and not any(_similar(key, missing) for key in _unknown(data, known)):
         raise ModelError(f'{name}: missing {", ".join(missing)}; is this a model file?')
     check_keys(data, known, '', name)
@@ -208,7 +209,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
 
 
 def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """Return what a hysteresis has beyond plays and a cubic."""
+    """Read the terms of a hysteresis beyond plays and a cubic."""
     wide: dict[str, Any] = {'p0': number(h, 'p0', name, 0.0)}
     for key in ('curves', 'relaxations'):
         if key not in h:
@@ -229,7 +230,7 @@ def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 
 def model_to_dict(model: StageModel) -> dict[str, Any]:
-    """Return a model as plain data, ready for YAML or JSON."""
+    """Convert a model to plain data, ready for YAML or JSON."""
     s, h = model.scaling, model.hysteresis
     data = {
         'schema_version': SCHEMA_VERSION,
@@ -258,7 +259,7 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
 
 
 def model_to_yaml(model: StageModel) -> str:
-    """Return the text of a model file."""
+    """Write the text of a model file."""
     text: str = yaml.dump(
         model_to_dict(model), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99
     )
@@ -272,9 +273,9 @@ def load(path: str | os.PathLike[str]) -> StageModel:
     Raises
     ------
     ConfigError
-        When the file cannot be read or is not YAML.
+        If the file cannot be read or is not YAML.
     ModelError
-        When it is not a model, or one of a later schema.
+        If the file is not a model, or has a later schema.
 
     Examples
     --------

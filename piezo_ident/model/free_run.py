@@ -4,8 +4,8 @@
 """
 Free runs: the displacement that a model predicts from the voltage of a record, and its errors.
 
-What the stage keeps of its motion before a record is estimated from the early part.  Over a short
-gap the run goes on along a straight line of voltage.
+The early part of a record tells the memory of the stage from earlier motion.  A short gap is
+crossed along a straight line of voltage.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from piezo_ident.record.record import Piece, Record
 @dataclass(frozen=True)
 class FreeRunErrors:
     """
-    How far a free run is from the measurement.
+    Errors of a free run against the measurement.
 
     Attributes
     ----------
     n : int
-        Samples judged: neither before a start that is estimated nor faulty readings.
+        Number of judged samples: faulty readings and samples before an estimated start are out.
     percent : float
-        `piezo_ident.model.metrics.percent_of_stroke`, by the stroke of the whole record.
+        `piezo_ident.model.metrics.percent_of_stroke` with the stroke of the whole record.
     fit : float
         `piezo_ident.model.metrics.fit_percent`.
     offset : float
-        Mean of measured minus predicted [m], as from a sensor that was set to zero again.
+        Mean of measured minus predicted [m]; a sensor that was zeroed again shifts it.
     percent_without_offset : float
         `percent` after subtracting `offset`.
     """
@@ -60,31 +60,31 @@ class FreeRunErrors:
 
     @property
     def only_offset(self) -> bool:
-        """Whether what is left without the offset is less than a tenth of the error."""
+        """Whether subtracting the offset leaves less than a tenth of the error."""
         return self.percent_without_offset < 0.1 * self.percent
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FreeRun(Showable):
     """
-    A model's free run over a record, beside what was measured.
+    Free run of a model over a record, with the measurement.
 
     Attributes
     ----------
     record : Record
-        Its masks leave out the faulty readings; its faults count them.
+        Record with masks that leave out faulty readings; its faults count them.
     pieces : tuple of ndarray
         Predicted displacement of each piece of the record [m].
     estimated : tuple of bool
         For each piece, whether its start was estimated from its early part.
     late : tuple of int
-        Of each piece, the first sample at which its start is forgotten, or was known.
+        For each piece, the first sample at which its start was known or is forgotten.
     errors : FreeRunErrors
-        Of every sample.
+        Errors over all samples.
     errors_after_start : FreeRunErrors or None
-        Of the samples from `late` on; None when there are none.
+        Errors over the samples from `late` on; None without such samples.
     warnings : tuple of str
-        What limits the trust in the prediction.
+        Limits of the trust in the prediction.
 
     Examples
     --------
@@ -116,24 +116,24 @@ class FreeRun(Showable):
 
 def free_run(model: StageModel, record: Record) -> FreeRun:
     """
-    Predict a record in free run, and compare it with what was measured.
+    Predict a record in free run, and compare it with the measurement.
 
-    A record that does not start at the lowest voltage starts from an unknown memory, which is
-    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
-    shows.  Nothing is fitted to the samples after that part.
+    A record that does not start at the lowest voltage starts with an unknown memory.  The memory
+    is estimated from its early part.  A model with creep also estimates creep of earlier motion,
+    if the early part shows it.  Nothing is fitted to the samples after the early part.
 
     Parameters
     ----------
     model : StageModel
     record : Record
-        Its displacement serves only the estimate and the errors.
+        Its displacement is only used for the estimate and the errors.
 
     Raises
     ------
     ModelError
-        When a piece has another sampling rate than the model, or the prediction overflows.
+        If a piece has another sampling rate than the model, or the prediction overflows.
     DataError
-        When the record holds no displacement; `StageModel.simulate` needs none.
+        If the record holds no displacement; `StageModel.simulate` needs none.
 
     Examples
     --------
@@ -161,7 +161,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
         estimated += [start is not None, *[False] * (len(pieces) - 1)]
         left = 0 if start is None else _late(model, one.piece, start)
         for piece in pieces:
-            # of the bridged samples, those of the gaps before this piece included
+            # bridged samples count, including the gaps before this piece
             gone = round((piece.start_time - pieces[0].start_time) * piece.sample_rate)
             late.append(min(max(left - gone, 0), piece.n))
     warnings = list(_on_starts(model, record, starts))
@@ -180,9 +180,9 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
 
 def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
     """
-    Return the errors of runs over one record, of the samples behind the starts of all of them.
+    Compute the errors of runs over one record on the same samples, behind all their starts.
 
-    Of the whole record where no such sample is.
+    The errors are those of the whole record if no such sample exists.
     """
     late = [max(starts) for starts in zip(*(run.late for run in runs), strict=True)]
     if not _judged(runs[0].record, late):
@@ -192,23 +192,23 @@ def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
 
 def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
     """
-    Return the displacement that the voltage of a record causes, whatever was measured.
+    Predict the displacement from the voltage of a record; the measurement is not used.
 
     Parameters
     ----------
     model : StageModel
     record : Record
-        Its displacement is not used; the stage is at rest under the first sample.
+        Its displacement is not used.  The stage is at rest under the first sample.
 
     Returns
     -------
     tuple of ndarray
-        One array a piece [m].
+        Displacement of each piece [m].
 
     Raises
     ------
     ModelError
-        When a piece has another sampling rate than the model, or the prediction overflows.
+        If a piece has another sampling rate than the model, or the prediction overflows.
     """
     _check_rates(model, record)
     record = with_quiet_voltage(record)
@@ -217,8 +217,8 @@ def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
 
 
 def _late(model: StageModel, piece: Piece, start: Start) -> int:
-    """Return the first sample of a bridged piece that an estimate of their start leaves free."""
-    # a voltage that rests forgets nothing
+    """Find the first sample of a bridged piece that does not depend on its estimated start."""
+    # a resting voltage never makes the stage forget
     if start.memory is not None and np.ptp(piece.v) == 0.0:
         return piece.n
     memory = start.memory is not None
@@ -226,7 +226,7 @@ def _late(model: StageModel, piece: Piece, start: Start) -> int:
 
 
 def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:
-    """Yield what was estimated of the motion before a record."""
+    """Yield warnings about estimated motion before a record."""
     found = [start for start in starts if start is not None]
     elsewhere = sum(start.memory is not None for start in found)
     if elsewhere:
@@ -268,10 +268,10 @@ def _predicted(
 
 def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> list[Array]:
     """
-    Return the predicted displacement [m] of pieces that follow each other over short gaps.
+    Predict the displacement [m] of pieces that follow each other over short gaps.
 
-    They are those of `piezo_ident.record.gaps.connected_pieces`; the start is that of the first
-    one, as of `StageModel.simulate`.
+    `piezo_ident.record.gaps.connected_pieces` gives such pieces.  `start` is the start of the
+    first piece, as in `StageModel.simulate`.
     """
     stream = model.stream(start)
     predicted = [stream.follow(pieces[0])]
@@ -282,12 +282,12 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
 
 
 def _judged(record: Record, starts: Sequence[int]) -> int:
-    """Return how many samples count, of each piece from a sample on."""
+    """Count the valid samples of each piece from a given sample on."""
     return sum(int(piece.mask[start:].sum()) for piece, start in zip(record, starts, strict=True))
 
 
 def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -> FreeRunErrors:
-    """Return the errors of each piece from a sample on, in blocks for the sake of memory."""
+    """Compute the errors of each piece from a sample on, in blocks to save memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
     def total(f: Callable[[Array, Array], Array]) -> float:
@@ -314,9 +314,9 @@ def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -
 @dataclass(frozen=True, eq=False)
 class PieceRun:
     """
-    The free run of a model on one piece of a record.
+    Free run of a model on one piece of a record.
 
-    y_hat and y_static, shape (n,), are the displacement from the whole model, and from its
+    y_hat and y_static, shape (n,), are the displacement by the whole model, and by its
     hysteresis alone [m].
     """
 
@@ -334,8 +334,8 @@ def piece_runs(
     """
     Run a model over all pieces that have its sampling rate.
 
-    `memories` are the starts of pieces, by the name of the record and the
-    start time of the piece; unknown ones are estimated as in `free_run`.
+    `memories` are the starts of pieces, by the name of the record and the start time of the
+    piece.  Unknown starts are estimated as in `free_run`.
     """
     static = model.without_dynamics()
     known = memories or {}

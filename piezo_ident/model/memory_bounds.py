@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the voltage tells of the memory of a stage whose earlier motion nobody saw."""
+"""Bound the memory of a stage whose earlier motion is unknown, from its voltage."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from piezo_ident.operators.hysteresis import Hysteresis
 
 class MemoryBounds:
     """
-    Bounds of the play outputs, and of lags along the path, of a stage whose motion nobody saw.
+    Bounds of the play outputs, and of lags along the path, after unknown motion.
 
-    The voltage was within `span` before.  A play at F stays within ``[v - r, v]``; a stroke as
-    wide as the play leaves one place.
+    The voltage was within `span` before the start.  The output F of a play stays within
+    ``[v - r, v]``, so a stroke as wide as the play leaves a single possible output.
 
     Parameters
     ----------
@@ -23,12 +23,12 @@ class MemoryBounds:
     v0 : float
         Voltage at the start, normalised.
     span : tuple of float
-        Least and largest voltage that the stage has seen, normalised.
+        Smallest and largest voltage that the stage has seen, normalised.
 
     Attributes
     ----------
     low, high : ndarray, shape (m,) or, with k lags, (m + k + 1,)
-        As memories of `Hysteresis.follow`; they stay where they met.
+        Bounds in the form of a memory of `Hysteresis.follow`; once equal, they stay equal.
 
     Examples
     --------
@@ -42,7 +42,7 @@ class MemoryBounds:
         self.forget(v0)
 
     def forget(self, v0: float) -> None:
-        """Begin anew at a voltage, after one that nobody saw."""
+        """Start again at a voltage, after unknown motion."""
         h, (low, high) = self._h, self._span
         r = h.thresholds
         floor = np.maximum(v0 - r, min(v0, low))
@@ -65,9 +65,9 @@ class MemoryBounds:
         return np.asarray(self.low[:m] == self.high[:m])
 
     def follow(self, v: Array) -> Array:
-        """Take the next voltages; return by how much w is unknown under each, shapes (n,)."""
+        """Follow the next voltages; the result is the uncertainty of w, shapes (n,)."""
         if np.array_equal(self.low, self.high):
-            # the free run follows them from here on
+            # the memory is known, so the free run needs no bounds from here on
             return np.zeros(v.size)
         floor, self.low = self._h.follow(v, self.low)
         ceiling, self.high = self._h.follow(v, self.high)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The scaling of a model: from volts and metres to numbers between zero and one, and back."""
+"""Scaling of a model: from volts and metres to numbers between zero and one, and back."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ class Scaling:
             raise ModelError('scaling: range must be [lowest, highest] voltage')
 
     def u(self, v: ArrayLike) -> Array:
-        """Return the normalised input."""
+        """Convert volts to the normalised input."""
         return (np.asarray(v, dtype=np.float64) - self.v0) / self.V
 
     def v(self, u: float) -> float:
-        """Return volts from the normalised input."""
+        """Convert the normalised input to volts."""
         return self.v0 + self.V * float(u)
 
     def y(self, x: ArrayLike) -> Array:
-        """Return metres from the normalised output."""
+        """Convert the normalised output to metres."""
         return self.y0 + self.Y * np.asarray(x, dtype=np.float64)
 
     def x(self, y: ArrayLike) -> Array:
-        """Return the normalised output from metres."""
+        """Convert metres to the normalised output."""
         return (np.asarray(y, dtype=np.float64) - self.y0) / self.Y

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The simulated stage: a model between a digital-to-analogue converter and a noisy, sampled sensor.
+Simulated stage: a model between a digital-to-analogue converter and a noisy, sampled sensor.
 
     command --> [DAC] --> applied voltage --> [StageModel] --> [+ noise] --> [ADC] --> reading
 
@@ -36,11 +36,11 @@ _SENSOR = ('noise_rms', 'dac_bits', 'dac_range', 'adc_bits', 'adc_range')
 @dataclass(frozen=True)
 class Converter:
     """
-    A converter between numbers and a physical quantity, with a range in the unit of the quantity.
+    Converter between numbers and a physical quantity, with a range in the unit of the quantity.
 
-    Its codes are ``low + k (high - low) / 2^bits``, k = 0 .. 2^bits - 1, so that zero is a code of
-    every symmetric range and `high` itself lies one step above the last.  ConfigError when the
-    resolution is not within 1 .. 32 bits, or the range is empty.
+    Its codes are ``low + k (high - low) / 2^bits``, k = 0 .. 2^bits - 1.  Zero is therefore a code
+    of every symmetric range, and `high` lies one step above the last code.  Raises ConfigError if
+    the resolution is not within 1 .. 32 bits, or the range is empty.
     """
 
     bits: int
@@ -61,21 +61,22 @@ class Converter:
         return (self.high - self.low) / 2.0**self.bits
 
     def quantise(self, x: Array) -> Array:
-        """Return the nearest codes; values outside the range become its last ones."""
+        """Round to the nearest codes; a value outside the range becomes the code at its end."""
         code = np.clip(np.rint((x - self.low) / self.step), 0.0, 2.0**self.bits - 1.0)
         return np.asarray(self.low + self.step * code)
 
     def outside(self, x: Array) -> int:
-        """Return how many values lie outside the range."""
+        """Count the values outside the range."""
         return int(np.count_nonzero((x < self.low) | (x > self.high)))
 
 
 @dataclass(frozen=True)
 class Sensor:
     """
-    The white noise of the sensor [m, rms], and the converters between computer and stage.
+    White noise of the sensor [m, rms], and the converters between computer and stage.
 
-    The DAC is in front of the amplifier [V], the ADC behind the sensor [m]; None is an ideal one.
+    The DAC is in front of the amplifier [V], the ADC behind the sensor [m].  None stands for an
+    ideal converter.
     """
 
     noise_rms: float = 0.0
@@ -90,14 +91,14 @@ class Sensor:
 @dataclass(frozen=True)
 class SimulatedStage:
     """
-    A model that plays the stage, with its converters and sensor noise.
+    Simulated stage: a model with converters and sensor noise.
 
     Attributes
     ----------
     model : StageModel
     sensor : Sensor
     seed : int
-        Of the sensor noise.
+        Seed of the sensor noise.
 
     Examples
     --------
@@ -115,14 +116,14 @@ class SimulatedStage:
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> SimulatedStage:
         """
-        Read a simulated stage: ``paper``, ``dense`` or ``effects``, or a file of one's own.
+        Read a simulated stage: ``paper``, ``dense`` or ``effects``, or a file of the user.
 
         Raises
         ------
         ConfigError
-            When the file cannot be read, or its sensor is not understood.
+            If the file cannot be read, or its sensor is invalid.
         ModelError
-            When its model is not understood.
+            If its model is invalid.
 
         Examples
         --------
@@ -135,21 +136,21 @@ class SimulatedStage:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Names of the axes: there is one, without a name."""
+        """Names of the axes: a single axis, without a name."""
         return ('',)
 
     @property
     def sample_rate(self) -> float:
-        """Samples a second [Hz]."""
+        """Sampling rate [Hz]."""
         return self.model.sample_rate
 
     @property
     def ideal(self) -> SimulatedStage:
-        """The same stage without noise and converters: its record is the displacement itself."""
+        """Same stage without noise and converters: its record is the displacement itself."""
         return SimulatedStage(self.model)
 
     def run(self, rng: np.random.Generator) -> StageRun:
-        """Return a run of this stage that takes the command block by block."""
+        """Start a run of this stage that takes the command block by block."""
         return StageRun(self, rng)
 
     def play(
@@ -159,28 +160,28 @@ class SimulatedStage:
         name: str = 'simulated',
     ) -> Record:
         """
-        Return what is measured while the stage plays a program.
+        Play a program on the stage, and record the measurement.
 
         Parameters
         ----------
         program : Program or Sequence
-            The command, which the record holds as its voltage.
+            Command; the record holds it as its voltage.
         rng : numpy.random.Generator, optional
-            For the sensor noise; one from the stage's seed when absent.
+            Generator of the sensor noise; by default one with the seed of the stage.
         name : str, optional
-            Of the record.
+            Name of the record.
 
         Returns
         -------
         Record
-            With a fault for each converter whose range the signal leaves.
+            Measurement, with a fault for each converter whose range the signal leaves.
 
         Raises
         ------
         ConfigError
-            When the program cannot be built at the stage's sampling rate.
+            If the program cannot be built at the sampling rate of the stage.
         ModelError
-            When stage and sequence differ in sampling rate.
+            If stage and sequence differ in sampling rate.
 
         Examples
         --------
@@ -193,7 +194,7 @@ class SimulatedStage:
         model = self.model
         sequence = program.build(model.sample_rate) if isinstance(program, Program) else program
         run = self.run(np.random.default_rng(self.seed) if rng is None else rng)
-        # a piece without measurement checks the rate and gives the time
+        # a piece without measurement checks the rate and supplies the time
         piece = _piece(sequence, np.zeros(sequence.n))
         model.check_rate(piece)
         t, y = piece.t, np.empty(sequence.n)
@@ -211,9 +212,9 @@ class SimulatedStage:
 
 class StageRun:
     """
-    One run of a simulated stage, block by block, in volts and metres.
+    Run of a simulated stage, block by block, in volts and metres.
 
-    The stage is at rest under the first command.  `clipped_input` and `clipped_output` are the
+    The stage is at rest under the first command.  `clipped_input` and `clipped_output` count the
     samples so far that left the range of the DAC and of the ADC.
     """
 
@@ -225,7 +226,7 @@ class StageRun:
         self._stream = stage.model.stream()
 
     def applied(self, v: ArrayLike) -> Array:
-        """Return the output of the DAC for a command [V], shape (n,)."""
+        """Compute the output of the DAC for a command [V], shape (n,)."""
         command, dac = np.asarray(v, dtype=np.float64), self.stage.sensor.dac
         return command if dac is None else dac.quantise(command)
 
@@ -233,10 +234,10 @@ class StageRun:
         self, v: ArrayLike, t: ArrayLike | None = None, channels: Mapping[str, Array] | None = None
     ) -> Array:
         """
-        Return the sensor's readings [m] for the next samples of command [V], shape (n,).
+        Compute the readings of the sensor [m] for the next samples of command [V], shape (n,).
 
-        The time [s] is counted from the first sample when absent; `channels` are further signals
-        that effects of the model depend on.
+        The time [s] is counted from the first sample by default.  `channels` are further signals
+        that effects of the model need.
         """
         sensor = self.stage.sensor
         command = np.asarray(v, dtype=np.float64)
@@ -259,8 +260,8 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
     """
     Build a simulated stage from plain data; see `SimulatedStage.load`.
 
-    The data are those of a model, and ``sensor`` and ``seed``: a plain model file is an ideal
-    stage.
+    The data are those of a model, with the keys ``sensor`` and ``seed``.  A plain model file is an
+    ideal stage.
     """
     sensor = data.get('sensor') or {}
     if not isinstance(sensor, Mapping):
@@ -278,7 +279,7 @@ def stage_from_dict(data: Mapping[str, Any], name: str = 'stage') -> SimulatedSt
 
 
 def seed_of(data: Mapping[str, Any], name: str) -> int:
-    """Return the seed of the configuration of a stage, 0 without one."""
+    """Read the seed in the configuration of a stage; 0 by default."""
     seed = data.get('seed', 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ConfigError(f'{name}: seed must be a whole number >= 0, got {reprlib.repr(seed)}')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The steady-state error of a model under sines, as in the paper's Table I."""
+"""Steady-state errors of a model under sines, as in Table I of the paper."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 
-#: what is dropped at the start of a sine: this time and at least one period [s]
+#: time that is dropped at the start of a sine, which is at least one period [s]
 SETTLING = 1.0
 
 _SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])', re.IGNORECASE)
@@ -29,12 +29,12 @@ class SineError:
     Attributes
     ----------
     frequency : float
-        [Hz]
+        Frequency of the sine [Hz].
     percent, static_percent : float
         `piezo_ident.model.metrics.percent_of_stroke` of the whole model and of the hysteresis
-        alone, by the stroke of the samples compared.
+        alone, with the stroke of the compared samples.
     n : int
-        Samples compared.
+        Number of compared samples.
     """
 
     frequency: float
@@ -45,7 +45,7 @@ class SineError:
 
 def sine_frequency(label: str) -> float | None:
     """
-    Return the frequency in a segment label [Hz], None when it names no sine.
+    Read the frequency in a segment label [Hz]; None if it does not name a sine.
 
     Examples
     --------
@@ -59,9 +59,9 @@ def sine_frequency(label: str) -> float | None:
 
 def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
     """
-    Return the steady-state error of every sine segment, by frequency.
+    Compute the steady-state error of every sine segment, sorted by frequency.
 
-    The first second and at least one period of each segment do not count; a segment that is then
+    The first second and at least one period of each segment do not count.  A segment whose rest is
     shorter than a period is left out.
     """
     rows = []
@@ -72,7 +72,7 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
             if frequency is None:
                 continue
             start = s.start + int(np.ceil(max(SETTLING, 1.0 / frequency) * rate))
-            # half a sample is forgiven: the period need not be a whole number of them
+            # tolerate half a sample: the period need not be a whole number of samples
             if s.stop - start < rate / frequency - 0.5:
                 continue
             steady = slice(start, s.stop)
@@ -93,9 +93,9 @@ def sines_of(runs: Sequence[PieceRun]) -> tuple[SineError, ...]:
 
 def sine_errors(model: StageModel, record: Record) -> tuple[SineError, ...]:
     """
-    Return what `sines_of` does of a record whose segments tell their frequency, as ``sine:50Hz``.
+    Compute the errors of `sines_of` for a record with segment labels such as ``sine:50Hz``.
 
-    A piece with sines that has another sampling rate than the model raises ModelError.
+    Raises ModelError if a piece with sines has another sampling rate than the model.
     """
     for piece in record:
         if piece.find('sine'):

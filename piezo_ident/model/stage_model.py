@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-StageModel: the chain of operators with its scaling, and what it predicts.
+StageModel: the chain of operators with its scaling, and its predictions.
 
     v --> [input] --> [ H ] --> [hidden] --> [ G ] --> [z^-d] --> [output] --> [acquisition] --> y
-          [input], [hidden], [output] and [acquisition] hold effects; those of H wrap it
+          [input], [hidden], [output] and [acquisition] hold effects; effects of H wrap it
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, Dynam
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record.record import Piece, Record
 
-#: share of the identified range below which a wrong unit is likelier than a small signal
+#: share of the identified range below which a wrong unit is more likely than a small signal
 FAINT = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
 class EffectSetting:
     """
-    An effect in a model: its name and parameters.
+    Effect in a model: its name and parameters.
 
-    ModelError when the name is unknown or a parameter is not as the effect declares.
+    Raises ModelError if the name is unknown or a parameter is not as the effect declares.
     """
 
     name: str
@@ -51,19 +51,19 @@ class EffectSetting:
 
     @property
     def slot(self) -> str:
-        """The place in the chain."""
+        """Place in the chain."""
         return find_effect(self.name).slot
 
     @property
     def channel(self) -> str:
-        """The further measured signal that it depends on; empty without one."""
+        """Further measured signal that the effect needs; empty without one."""
         return str(self.parameters.get('channel', ''))
 
 
 @dataclass(frozen=True, eq=False)
 class StageModel(FrontDoor):
     """
-    A stage: H, G, delay and effects, with its scaling and how it was identified.
+    Model of a stage: H, G, delay and effects, with its scaling and its identification.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class StageModel(FrontDoor):
     Raises
     ------
     ModelError
-        When the dynamics are unstable or the rate is not positive.
+        If the dynamics are unstable or the rate is not positive.
 
     Examples
     --------
@@ -119,17 +119,17 @@ class StageModel(FrontDoor):
 
     @property
     def is_static(self) -> bool:
-        """Whether neither G nor the delay nor an effect depends on the sampling rate."""
+        """Whether the model is H and a gain alone, and so holds at any sampling rate."""
         return self.dynamics.is_static and self.delay.total == 0.0 and not self.effects
 
     def without_dynamics(self) -> StageModel:
-        """Return the hysteresis alone, times the static gain of G; no delay, no effects."""
+        """Reduce the model to its hysteresis, times the static gain of G."""
         static = replace(Dynamics.unit(), b=np.array([self.dynamics.gain]))
         return replace(self, dynamics=static, delay=Delay(0), effects=())
 
     def chain(self, start: StartLike = None) -> Chain:
         """
-        Return fresh operators in their order.
+        Make new operators, in the order of the chain.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class StageModel(FrontDoor):
         Raises
         ------
         ModelError
-            When the start is that of another model.
+            If the start belongs to another model.
         """
         start = Start.of(start)
         core: Operator = HysteresisOperator(self.hysteresis, start.memory)
@@ -163,7 +163,7 @@ class StageModel(FrontDoor):
         )
 
     def effects_in(self, slot: Slot) -> list[EffectSetting]:
-        """Return the effects that are operators in a slot; a change of the delay is not."""
+        """List the operators in a slot; a change of the delay is an effect without an operator."""
         return [
             s for s in self.effects if s.slot == slot and not find_effect(s.name).in_delay_line
         ]
@@ -172,11 +172,11 @@ class StageModel(FrontDoor):
         return [find_effect(s.name)(self.sample_rate, s.parameters) for s in self.effects_in(slot)]
 
     def input_chain(self) -> Chain:
-        """Return fresh operators of the effects of the input slot."""
+        """Make new operators of the effects in the input slot."""
         return Chain(tuple(self._operators('input')))
 
     def hysteresis_input(self, piece: Piece) -> Array:
-        """Return the normalised voltage behind the effects of the input slot, shape (n,)."""
+        """Compute the normalised voltage behind the effects of the input slot, shape (n,)."""
         u = self.scaling.u(piece.v)
         chain = self.input_chain()
         chain.reset(float(u[0]), float(u[0]))
@@ -185,12 +185,12 @@ class StageModel(FrontDoor):
     @property
     def total_delay(self) -> Delay:
         """
-        The identified delay and its change by effects.
+        Identified delay, with its change by effects.
 
         Raises
         ------
         ModelError
-            When the sum is negative.
+            If the sum is negative.
         """
         added = sum(find_effect(s.name).added_delay(s.parameters) for s in self.effects)
         if added == 0.0:
@@ -212,7 +212,7 @@ class StageModel(FrontDoor):
         start: StartLike = None,
     ) -> Array:
         """
-        Return the displacement that a voltage causes, in free run; warn outside the range.
+        Simulate the displacement under a voltage in free run; warn outside the identified range.
 
         Parameters
         ----------
@@ -222,20 +222,20 @@ class StageModel(FrontDoor):
             Further signals that effects of the model depend on.
         start : Start, or array_like of shape (m,) or (m + k,), optional
             Play outputs before the first sample, normalised, and behind them the lags along the
-            path; those of a stage that last came down to zero when absent.  A
-            `piezo_ident.model.stream.Start` says also how far creep is from its rest.
+            path.  By default these belong to a stage that last came down to zero.  A
+            `piezo_ident.model.stream.Start` also holds the distance of creep from its rest.
 
         Returns
         -------
         ndarray, shape (n,)
-            [m]
+            Displacement [m].
 
         Raises
         ------
         DataError
-            When the voltage is not a vector of finite numbers, or a channel has another length.
+            If the voltage is not a vector of finite numbers, or a channel has another length.
         ModelError
-            When an effect needs a channel that is not given.
+            If an effect needs a missing channel.
 
         Examples
         --------
@@ -259,7 +259,7 @@ class StageModel(FrontDoor):
 
     def stream(self, start: StartLike = None) -> Stream:
         """
-        Return a run of this model that takes the voltage block by block.
+        Start a run of this model that takes the voltage block by block.
 
         Parameters
         ----------
@@ -281,18 +281,18 @@ class StageModel(FrontDoor):
 
     def predict_piece(self, piece: Piece, start: StartLike = None) -> Array:
         """
-        Return the predicted displacement of one piece [m], shape (n,).
+        Predict the displacement of a piece [m], shape (n,).
 
         Raises
         ------
         ModelError
-            When the piece has another sampling rate.
+            If the piece has another sampling rate.
         """
         self.check_rate(piece)
         return self.stream(start).follow(piece)
 
     def takes(self, piece: Piece) -> bool:
-        """Return whether the model holds at the sampling rate of a piece."""
+        """Tell whether the model holds at the sampling rate of a piece."""
         return self.is_static or abs(piece.sample_rate / self.sample_rate - 1.0) < 1e-6
 
     def check_rate(self, piece: Piece) -> None:
@@ -310,13 +310,13 @@ class StageModel(FrontDoor):
             )
 
     def outside(self, v: Array) -> Mask:
-        """Return which voltages [V] lie outside the range of the identification."""
+        """Mark the voltages [V] outside the identified range."""
         low, high = self.scaling.range
         slack = 1e-3 * (high - low)
         return np.asarray((v < low - slack) | (v > high + slack))
 
     def extrapolation(self, record: Record) -> tuple[str, ...]:
-        """Return a warning when the voltage differs from that of the identification."""
+        """Warn if the voltage leaves the identified range, or is far smaller than it."""
         low, high = self.scaling.range
         least, most = record.voltage_range
         identified = f'the identified range {low:g} .. {high:g} V'

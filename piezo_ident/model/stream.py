@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One run of a model, block by block: in volts, out metres."""
+"""Run a model block by block: volts in, metres out."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from piezo_ident.record.record import Piece
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
 
-#: samples that pass the chain at once; small enough for the signals to stay in the cache
+#: number of samples that pass the chain at once; the signals then stay in the cache
 CHUNK = 8192
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
     """
-    What a stage keeps of its motion before a run.
+    State of a stage from its motion before a run.
 
     Attributes
     ----------
     memory : array_like, shape (m,) or (m + k,), or None
-        Play outputs, normalised, and behind them the lags along the path; None for those of a
-        stage that last came down to zero.
+        Play outputs, normalised, and behind them the lags along the path.  None stands for the
+        outputs of a stage that last came down to zero.
     creep : ndarray, shape (c,)
-        How far each element of creep is beyond its rest, normalised; empty where all rest.
+        Distance of each element of creep from its rest, normalised; empty if all are at rest.
     """
 
     memory: ArrayLike | None = None
@@ -45,20 +45,20 @@ class Start:
 
     @classmethod
     def of(cls, start: StartLike) -> Start:
-        """Return a start of which the memory alone may be given."""
+        """Make a start; a bare array is the memory of the plays."""
         return start if isinstance(start, Start) else cls(start)
 
 
-#: where a run begins; of an array, the memory alone
+#: start of a run; a bare array is the memory of the plays
 StartLike: TypeAlias = 'Start | ArrayLike | None'
 
 
 class Stream:
     """
-    One run of a model, block by block, in volts and metres.
+    Run of a model, block by block, in volts and metres.
 
-    The stage is at rest under the first sample after construction or `reset`, but for what a
-    start says.
+    After construction or `reset` the stage is at rest under the first sample, except for the
+    state in `start`.
     """
 
     def __init__(self, model: StageModel, start: StartLike = None) -> None:
@@ -73,7 +73,7 @@ class Stream:
                     self._cascade = _Cascade(model, H, G, z)
 
     def reset(self, v0: float) -> float:
-        """Come to rest at a voltage [V] and return the displacement there [m]."""
+        """Come to rest at a voltage [V]; the result is the displacement there [m]."""
         u0 = float(self.model.scaling.u(v0))
         self._count, self._started = 0, True
         if self._cascade is not None:
@@ -81,7 +81,7 @@ class Stream:
         return float(self.model.scaling.y(self._chain.reset(u0, u0)))
 
     def follow(self, piece: Piece) -> Array:
-        """Return the displacement [m] for the next samples, a piece or a part of one."""
+        """Compute the displacement [m] for the next samples, a piece or a part of a piece."""
         y = np.empty(piece.n)
         for start in range(0, piece.n, CHUNK):
             cut = slice(start, start + CHUNK)
@@ -93,7 +93,7 @@ class Stream:
         return y
 
     def bridge(self, one: Piece, other: Piece) -> None:
-        """Cross the gap between two pieces of one clock, over a straight line if it is unknown."""
+        """Cross the gap between two pieces of one clock; an unknown voltage becomes a line."""
         if played := played_before(one, other):
             self.follow(played)
             return
@@ -111,9 +111,9 @@ class Stream:
 
     def recall(self, v: Array, t: Array) -> None:
         """
-        Bring amplifier and plays into their state after a past voltage; the rest is at rest.
+        Bring amplifier and plays into their state after a past voltage; other states are at rest.
 
-        Voltage [V] and time [s] have shape (n,); the stage was at rest before the first sample.
+        Voltage [V] and time [s] have shape (n,).  The stage was at rest before the first sample.
         """
         self.reset(float(v[0]))
         if self._cascade is not None:
@@ -133,9 +133,9 @@ class Stream:
         self, v: ArrayLike, t: ArrayLike | None = None, channels: Mapping[str, Array] | None = None
     ) -> Array:
         """
-        Return the displacement [m] for the next samples of voltage [V], shape (n,).
+        Compute the displacement [m] for the next samples of voltage [V], shape (n,).
 
-        The time [s] is counted from the first sample when absent; `channels` are further measured
+        The time [s] is counted from the first sample by default.  `channels` are further measured
         signals.
         """
         x = np.asarray(v, dtype=np.float64)
@@ -163,7 +163,7 @@ class _Cascade:
     ) -> None:
         s = model.scaling
         past_w, past_y = G.b.size - 1, max(G.a.size, z.delay.samples + 1)
-        # a long delay would else spend its time on moving its past
+        # without this room, a long delay would spend its time on moving its past
         room = max(STRETCH, past_y)
         self._H, self._G, self._delay = H, G, z.delay
         self._w, self._y = np.empty(past_w + room), np.empty(past_y + room)
@@ -173,7 +173,7 @@ class _Cascade:
         self._hysteresis = (*h.for_kernel, lags)
 
     def reset(self, u0: float) -> float:
-        """Come to rest and return the displacement there [m]."""
+        """Come to rest; the result is the displacement there [m]."""
         w0 = self._H.reset(u0, u0)
         rest = self._G.reset(u0, w0)
         m, memory = self._H.hysteresis.thresholds.size, self._H.memory
@@ -184,9 +184,9 @@ class _Cascade:
         return float(y0 + Y * rest)
 
     def run(self, v: Array) -> Array:
-        """Return the displacement [m] for the next samples, shape (n,)."""
+        """Compute the displacement [m] for the next samples, shape (n,)."""
         out = np.empty(v.size)
-        # a frozen array would be another type to the compiler
+        # a copy of a frozen array, which would be another type to the compiler
         v = v if v.flags.carray else v.copy()
         cascade(
             v,

@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A simulated stage of two axes, with creep in one and hysteresis inside the loop of its mechanics.
+Simulated stage of two axes, with creep in one axis and hysteresis inside its mechanics.
 
 Two modes carry both axes, so either voltage moves both displacements:
 
     q_i'' + 2 zeta_i w_i q_i' + w_i^2 q_i = w_i^2 phi_i (u + p),      e = Phi^-1 q
 
-u are the voltages and e what the actuators extend, in volts.  Each actuator's stiffness is
-hysteretic: what it has yielded since the start pushes once more,
+u are the voltages and e the extensions of the actuators, in volts.  The stiffness of each actuator
+is hysteretic: its yielding since the start pushes a second time,
 
     p = h (s - z),   s = e - c u,   dz = ds (1 - (|z| / z0 where |z| grows, else 0))
 
-the law of Bouc and Wen with n = 1 and A = 1, beta = gamma = 1 / (2 z0).  Small loops lose energy
-and stiffness in proportion to their amplitude, as Rayleigh's do.  s mixes stress and field, so
-the loops open where a mode rings, too.  A model that is a sum of plays can only come near.
+This is the law of Bouc and Wen with n = 1, A = 1 and beta = gamma = 1 / (2 z0).  Small loops lose
+energy and stiffness in proportion to their amplitude, as in Rayleigh's law.  s mixes stress and
+field, so the loops also open where a mode rings.  A sum of plays can only approximate this stage.
 
     y = gain Phi^T q, and of the axis that creeps  + gain sum_k g_k (u filtered by 1 / (1 + T_k s))
 """
@@ -43,7 +43,7 @@ from piezo_ident.model.simulated_stage import seed_of, SimulatedStage, stage_fro
 from piezo_ident.record.record import Piece, Record
 from scipy.linalg import expm
 
-#: steps of the mechanics in a sample
+#: number of steps of the mechanics in a sample
 STEPS = 4
 _KEYS = ('axes', 'sample_rate', 'gain', 'modes', 'hysteresis', 'creep', 'noise_rms', 'seed')
 
@@ -51,29 +51,30 @@ _KEYS = ('axes', 'sample_rate', 'gain', 'modes', 'hysteresis', 'creep', 'noise_r
 @dataclass(frozen=True, eq=False)
 class TwoAxisStage:
     """
-    The equations above, sampled.
+    Sampled stage of two axes; the module has the equations.
 
     Attributes
     ----------
     axes : tuple of str
-        Their names; the first has none.
+        Names of the axes; the first name is empty.
     sample_rate : float
-        [Hz]
+        Sampling rate [Hz].
     gain : float
-        [m/V]
+        Gain [m/V].
     frequency, damping : ndarray, shape (2,)
-        Of the modes [Hz, 1].
+        Frequency [Hz] and damping ratio of the modes.
     shape : ndarray, shape (2, 2)
-        Phi, a row a mode.
+        Phi, one row for each mode.
     hysteresis : tuple of float
         h, c and z0 [1, 1, V]; h = 0 makes a linear stage.
     creep_axis : int
+        Index of the axis that creeps.
     creep_gain, creep_time : ndarray, shape (m,)
-        g and T [1, s].
+        Shares g and time constants T of creep [1, s].
     noise_rms : float
-        Of the sensors [m].
+        Rms noise of the sensors [m].
     seed : int
-        Of their noise.
+        Seed of the noise.
 
     Examples
     --------
@@ -100,12 +101,12 @@ class TwoAxisStage:
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> TwoAxisStage:
         """
-        Read a stage: ``two_axes``, or a file of one's own.
+        Read a stage: ``two_axes``, or a file of the user.
 
         Raises
         ------
         ConfigError
-            When the file cannot be read or is not understood.
+            If the file cannot be read or is invalid.
 
         Examples
         --------
@@ -117,7 +118,7 @@ class TwoAxisStage:
         return two_axis_stage_from_dict(load_yaml(path), str(path))
 
     def run(self, rng: np.random.Generator) -> TwoAxisRun:
-        """Return a run that takes the commands block by block, from rest at 0 V."""
+        """Start a run that takes the commands block by block, from rest at 0 V."""
         return TwoAxisRun(self, rng)
 
     def play(
@@ -127,20 +128,20 @@ class TwoAxisStage:
         name: str = 'simulated',
     ) -> Record:
         """
-        Return what is measured while every axis plays a program with random signals of its own.
+        Play a program on every axis, with random signals of its own, and record the measurement.
 
         Parameters
         ----------
         program : Program, or two of Sequence
         rng : numpy.random.Generator, optional
-            For the sensor noise; one from the stage's seed when absent.
+            Generator of the sensor noise; by default one with the seed of the stage.
         name : str, optional
-            Of the record.
+            Name of the record.
 
         Raises
         ------
         ConfigError
-            When the program cannot be built at the stage's sampling rate.
+            If the program cannot be built at the sampling rate of the stage.
         """
         if isinstance(program, Program):
             program = build_axes(program, 2, self.sample_rate)
@@ -156,7 +157,7 @@ class TwoAxisStage:
 
 class TwoAxisRun:
     """
-    One run of a stage of two axes, block by block; how it is cut changes no bit.
+    Run of a stage of two axes, block by block; the result does not depend on the blocks.
 
     There are no converters: `clipped_input` and `clipped_output` are always 0.
     """
@@ -169,14 +170,14 @@ class TwoAxisRun:
         self._mechanics = a, b, np.ascontiguousarray(np.linalg.inv(stage.shape.T))
         creep = -np.expm1(-1.0 / (stage.sample_rate * stage.creep_time))
         self._creep = creep, stage.creep_gain, np.zeros(creep.size)
-        # position and speed of either mode; s and z of either actuator
+        # position and speed of each mode; s and z of each actuator
         self._state, self._memory = np.zeros((2, 2)), np.zeros((2, 2))
 
     def process(self, v: ArrayLike) -> Array:
         """
-        Return the readings [m], shape (n, 2), for the next commands [V], shape (n, 2).
+        Compute the readings [m], shape (n, 2), for the next commands [V], shape (n, 2).
 
-        A reading is taken before the command of its own sample acts.
+        A reading is taken before the command of the same sample acts.
         """
         u = np.ascontiguousarray(v, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != 2:
@@ -194,7 +195,7 @@ class TwoAxisRun:
 
 
 def _sampled(stage: TwoAxisStage) -> tuple[Array, Array]:
-    """Return transition and input of each mode over a step, shapes (2, 2, 2) and (2, 2)."""
+    """Compute transition and input of each mode over a step, shapes (2, 2, 2) and (2, 2)."""
     a, b = np.empty((2, 2, 2)), np.empty((2, 2))
     for i, (frequency, zeta) in enumerate(zip(stage.frequency, stage.damping, strict=True)):
         w = 2.0 * math.pi * frequency
@@ -232,12 +233,12 @@ def _move(
             crept[m] += creep[m] * (u[k, creep_axis] - crept[m])
         for _ in range(STEPS):
             for j in range(2):
-                # e solves q = Phi e: each mode carries what the actuators extend by its shape
+                # e solves q = Phi e: each mode carries the extensions, weighted by its shape
                 e = inverse[0, j] * state[0, 0] + inverse[1, j] * state[1, 0]
                 s = e - c * u[k, j]
                 ds, z = s - memory[j, 0], memory[j, 1]
                 if ds * z < 0.0:
-                    # back to zero without yielding, and what is left of the way beyond
+                    # back to zero without yielding; ds keeps the rest of the way
                     back = min(abs(ds), abs(z))
                     z += math.copysign(back, ds)
                     ds -= math.copysign(back, ds)
@@ -255,7 +256,7 @@ def _move(
 
 
 def load_stage(name_or_path: str | os.PathLike[str]) -> SimulatedStage | TwoAxisStage:
-    """Read a stage of one axis, or of two where its file has the key ``axes``."""
+    """Read a stage of one axis, or of two axes if its file has the key ``axes``."""
     path = find_config(name_or_path, 'stage')
     data = load_yaml(path)
     return (two_axis_stage_from_dict if 'axes' in data else stage_from_dict)(data, str(path))
@@ -309,7 +310,7 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
 
 
 def _check(stage: TwoAxisStage, name: str) -> None:
-    """Refuse numbers that no stage has."""
+    """Refuse impossible values."""
     h, c, z0 = stage.hysteresis
     if not np.isfinite([stage.sample_rate, stage.gain, h, c, z0, stage.noise_rms]).all():
         raise ConfigError(f'{name}: sample_rate, gain, hysteresis and noise_rms must be finite')
