@@ -44,18 +44,18 @@ BAG_BYTES, SPARE = 2 * 16 * RATE * 1.1, 4e9
 HOUR = 3600.0
 #: title, lengths [s], and those of a quick run, of each measure
 PLANS: dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]] = {
-    'stream': ('Prediction second by second: constant memory', (10, 60, 600, HOUR), (10, 60)),
-    'predict': ('Prediction of a record in memory', (10, 30, 60, 120, 300, 600), (10, 60)),
-    'write': ('Writing a bag', (10, 60, 600, HOUR), (10, 60)),
-    'read': ('Reading a bag into a record', (10, 60, 600, HOUR), (10, 60)),
-    'convert': ('Converting a bag to npz, its samples in memory maps', (10, 60, 600, HOUR), (10,)),
+    'stream': ('prediction, streamed', (10, 60, 600, HOUR), (10, 60)),
+    'predict': ('prediction in memory', (10, 30, 60, 120, 300, 600), (10, 60)),
+    'write': ('bag written', (10, 60, 600, HOUR), (10, 60)),
+    'read': ('bag read', (10, 60, 600, HOUR), (10, 60)),
+    'convert': ('bag converted to npz', (10, 60, 600, HOUR), (10,)),
     'predict_bag': (
-        'Predicting a bag to npz, its samples in memory maps',
+        'bag predicted to npz',
         (10, 60, 600, HOUR),
         (10, 60),
     ),
-    'identify': ('Identification, the three steps', (15.5, 31, 62, 124, HOUR), (15.5,)),
-    'diagnose': (f'Diagnosis, {len(catalogue())} candidates', (15, 30, 60, 120), (17,)),
+    'identify': ('identification', (15.5, 31, 62, 124, HOUR), (15.5,)),
+    'diagnose': (f'diagnosis, {len(catalogue())} candidates', (15, 30, 60, 120), (17,)),
 }
 OF_BAGS = ('write', 'read', 'convert', 'predict_bag')
 

@@ -138,9 +138,7 @@ def page(outcomes: Iterable[Outcome], command: str, load: float) -> str:
             text += ['', f'## `{outcome.name}` failed', '', f'No result: {outcome.reason}']
         for title, body in outcome.sections:
             text += ['', f'## {title}', '', body.strip()]
-    text += ['', '## Time taken', '', '| benchmark | s |', '|---|---|']
-    text += [f'| `{outcome.name}` | {outcome.seconds:.0f} |' for outcome in outcomes]
-    text += [f'| all | {sum(outcome.seconds for outcome in outcomes):.0f} |', '']
+    text += ['', f'All took {sum(outcome.seconds for outcome in outcomes):.0f} s.', '']
     return '\n'.join(text)
 
 

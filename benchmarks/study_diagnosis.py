@@ -34,7 +34,7 @@ from piezo_ident.model.free_run import free_run
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from side_by_side import machine
-from study_rows import all_rows, section, some, write_cases
+from study_rows import all_rows, counts_of, section, some, write_cases, write_csv
 from truths import describe, EFFECTS, make_stage, other_axis, OUTSIDE, program
 
 RATE = 20_000.0
@@ -219,26 +219,23 @@ PURPOSE = (
 )
 NOTE = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
-    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. The laws of '
-    'the stages (below) are not those of the candidates. The size of an effect is the free-run '
-    'error that a refit of a sum of plays leaves on kinds of motion held out, in % of stroke. An '
-    f'effect of {COUNTS} % and more is counted. Hidden: the verdict has no name, and the effect '
-    'is among two or three that may hide in the base model.'
+    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. The '
+    '[laws of the stages]({laws}) are not those of the candidates. The size of an effect is the '
+    'free-run error that a refit of a sum of plays leaves on kinds of motion held out, in % of '
+    f'stroke. An effect of {COUNTS} % and more is counted. Hidden: the verdict has no name, and '
+    'the effect is among two or three that may hide in the base model.'
 )
 Done = Sequence[tuple[Case, Row]]
 
 
 def line(name: str, own: Done) -> list[object]:
     """Return a row of a table: the outcomes, and the median errors on the unseen record."""
-    outcomes = [outcome(case, row) for case, row in own]
     medians = [
         f'{np.median([getattr(r, error) for _, r in own]):.3f}' if own else ''
         for error in ('unseen_before', 'unseen_after')
     ]
-    return [name, len(own), *(outcomes.count(kind) for kind in KINDS), *medians]
-
-
-HEADS = f'counted, {", ".join(KINDS)}, unseen error before, after'
+    outcomes = counts_of((outcome(case, row) for case, row in own), KINDS)
+    return [name, len(own), outcomes, *medians]
 
 
 def single(done: Done) -> str:
@@ -250,7 +247,8 @@ def single(done: Done) -> str:
         for kinds in (('exact',), ('exact', 'class'), ('wrong',), ('hidden',))
     )
     lines = (line(name, [x for x in counted if x[0].effects == (name,)]) for name in EFFECTS)
-    text = section('One effect', f'effect, {HEADS}', lines)
+    heads = 'effect, counted, outcomes, unseen error before, after'
+    text = section('One effect', heads, lines)
     stated = some(set(row.found) == set(case.effects) for case, row in counted)
     told = some(is_told(case, row) for case, row in counted)
     text += (
@@ -286,18 +284,17 @@ def outside(done: Done) -> str:
     """Return the section of effects that are not among the candidates."""
     own = [(c, r) for c, r in done if c.kind in ('removed', 'outside') and r.size >= COUNTS]
 
-    def counts(kind: str) -> list[object]:
-        verdicts = [r.verdict for c, r in own if c.kind == kind]
-        return [len(verdicts), *(verdicts.count(verdict) for verdict in VERDICTS)]
-
-    text = section(
-        'Effects that are no candidates',
-        f'truth, counted, {", ".join(VERDICTS)}',
-        (
-            ['a candidate taken out of the catalogue', *counts('removed')],
-            ['an effect outside the catalogue', *counts('outside')],
-        ),
+    lines = (
+        [what, len(verdicts), counts_of(verdicts, VERDICTS)]
+        for what, verdicts in (
+            (what, [r.verdict for c, r in own if c.kind == kind])
+            for what, kind in (
+                ('a candidate taken out of the catalogue', 'removed'),
+                ('an effect outside the catalogue', 'outside'),
+            )
+        )
     )
+    text = section('Effects that are no candidates', 'truth, counted, verdicts', lines)
     return f'{text}\n\nA wrong name in {some(r.verdict == "named" for _, r in own)}.'
 
 
@@ -329,21 +326,18 @@ def case_line(case: Case, row: Row) -> list[object]:
 def write(rows: dict[str, Row], todo: Sequence[Case], page: Path) -> None:
     """Write the page of the study, and the file of its cases."""
     done = [(case, rows[case.key]) for case in todo if case.key in rows]
+    laws = page.with_name(f'{page.stem}_laws.csv')
+    write_csv(laws, 'effect, law', ([name, describe(name)] for name in (*EFFECTS, *OUTSIDE)))
     sections = [
         '# How often the diagnosis is right',
         PURPOSE,
         f'Made by `make study`; {len(done)} of {len(todo)} cases done.\nMachine: {machine()}.',
-        NOTE,
+        NOTE.format(laws=laws.name),
         write_cases(page, CASE_HEADS, (case_line(c, r) for c, r in done)),
         single(done),
         none(done),
         outside(done),
         pairs(done),
-        section(
-            'Laws of the stages',
-            'effect, law',
-            ([name, describe(name)] for name in (*EFFECTS, *OUTSIDE)),
-        ),
     ]
     page.write_text('\n\n'.join(sections) + '\n', encoding='utf-8')
 

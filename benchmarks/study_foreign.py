@@ -44,7 +44,7 @@ from piezo_ident.model.free_run import free_run, same_part_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from side_by_side import machine
-from study_rows import all_rows, part_of, section, some, write_cases
+from study_rows import all_rows, counts_of, part_of, section, some, write_cases
 from truths import other_axis
 
 #: in the data, not in the stage: they count whatever their size
@@ -479,8 +479,8 @@ def by_effect(rows: Sequence[Row]) -> str:
     lines = []
     for name in sorted(names):
         outcomes = [outcome(r) for r in names[name]]
-        lines.append([name, len(outcomes), *(outcomes.count(x) for x in OUTCOMES)])
-    return section('One effect or fault', f'hidden, cases, {", ".join(OUTCOMES)}', lines)
+        lines.append([name, len(outcomes), counts_of(outcomes, OUTCOMES)])
+    return section('One effect or fault', 'hidden, cases, outcomes', lines)
 
 
 def by_core(rows: Sequence[Row]) -> str:

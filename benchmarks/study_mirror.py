@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 import os
 from pathlib import Path
 import sys
@@ -43,8 +42,6 @@ HELD_OUT = (4, 5)
 ORDERS = (28, 36, 44, 52)
 #: time constants of the level in samples that are tried besides that of the model
 MEMORIES = (5.0, 30.0)
-#: edges of bands in Hz
-EDGES = (0, 50, 400, 780, 1000, 1450, 2050, 2400, 3000, 3200)
 #: published on the test part, pooled, one model for all amplitudes
 PUBLISHED = {
     'published, linear': (18.6, 6.6, 16.3),
@@ -93,12 +90,6 @@ outputs and realisations held out. The fifth column is the mean over outputs and
 
 *Spectra of the outputs held out, of the errors of two models, and of the noise between periods:
 rms in bands of 25 Hz, in % of rms(y).*
-
-Share of the error by frequency, in % of rms(y), held out, 100 / 200 / 300 mV:
-
-| Hz | motion | one linear model | linear for each amplitude | hysteretic stiffness | noise |
-|---|---|---|---|---|---|
-{bands}
 
 ## What was added
 
@@ -416,7 +407,6 @@ def main() -> None:
         'held_out': ' and '.join(map(str, HELD_OUT)),
         'found': sentence(explanation),
         'rows': table(explanation),
-        'bands': band_rows(found),
         'order': linear.order,
         'orders': ', '.join(f'{o}: {e:.2f} %' for o, e in errors.items()),
         'memory': model.memory,
@@ -437,19 +427,6 @@ def main() -> None:
 def beside(share: float) -> str:
     """Say whether other programs took the processors; `share` of one is what was had."""
     return ', with less than one of them for itself: other work ran beside it' if share < 1 else ''
-
-
-def band_rows(found: dict[str, list[Array]]) -> str:
-    edges = np.array(EDGES, dtype=float)
-    by_band = {
-        name: np.array([in_bands(s, edges) for s in of_groups])
-        for name, of_groups in found.items()
-    }
-    rows = []
-    for i, (low, high) in enumerate(pairwise(EDGES)):
-        parts = [' / '.join(f'{v:.2f}' for v in by_band[name][:, i]) for name in found]
-        rows.append(f'| {low} to {high} | {" | ".join(parts)} |')
-    return '\n'.join(rows)
 
 
 def count(model: LoopModel) -> int:

@@ -28,17 +28,28 @@ def some(facts: Iterable[object]) -> str:
     return part_of(sum(known), len(known))
 
 
+def counts_of(outcomes: Iterable[str], order: Iterable[str]) -> str:
+    """Return how often each outcome came, `6 exact, 3 class`."""
+    known = list(outcomes)
+    return ', '.join(f'{known.count(kind)} {kind}' for kind in order if kind in known)
+
+
 def section(title: str, heads: str, rows: Iterable[Sequence[object]]) -> str:
     """Return a section with a table; the heads are separated by commas."""
     return f'## {title}\n\n{markdown(heads.split(", "), rows)}'
+
+
+def write_csv(target: Path, heads: str, rows: Iterable[Sequence[object]]) -> None:
+    """Write a table as CSV; the heads are separated by commas."""
+    with target.open('w', encoding='utf-8', newline='') as file:
+        csv.writer(file, lineterminator='\n').writerows([heads.split(', '), *rows])
 
 
 def write_cases(page: Path, heads: str, rows: Iterable[Sequence[object]]) -> str:
     """Write one line for each case into a CSV file beside a page, and return the page's link."""
     target = page.with_suffix('.csv')
     lines = list(rows)
-    with target.open('w', encoding='utf-8', newline='') as file:
-        csv.writer(file, lineterminator='\n').writerows([heads.split(', '), *lines])
+    write_csv(target, heads, lines)
     return (
         f'Every case: [{target.name}]({target.name}), {len(lines)} lines; errors in % of stroke.'
     )
