@@ -213,9 +213,8 @@ def is_told(case: Case, row: Row) -> bool:
 KINDS = ('exact', 'class', 'hidden', 'partly', 'refitted', 'unexplained', 'none', 'wrong')
 VERDICTS = ('named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none')
 PURPOSE = (
-    'This page tells whoever must trust a verdict how often it was right on simulated stages '
-    'that are sums of plays with something added. '
-    '[The second study](diagnosis_study_foreign.md) has stages that are no sums of plays.'
+    'This page tells whoever must trust a verdict how often it was right on simulated sums of '
+    'plays with an effect. [The second study](diagnosis_study_foreign.md) has other hysteresis.'
 )
 NOTE = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '

@@ -366,22 +366,22 @@ def outcome(row: Row) -> str:
 
 OUTCOMES = ('named', 'class', 'part', 'hidden', 'abstained', 'false', 'failed')
 PURPOSE = (
-    'This page tells whoever must trust a verdict how often it was right on simulated stages '
-    'that are no sums of plays, as a measured stage is none.'
+    'This page tells whoever must trust a verdict how often it was right on simulated stages with '
+    'other families of hysteresis than sums of plays.'
 )
 NOTE = (
-    'The hysteresis of a stage is of another family, behind two or three lightly damped modes '
-    'and a delay of any fraction of a sample, at 10, 20 or 50 kHz, over 0..10, 0..100 or '
-    '-20..130 V, for 5 to 200 um of stroke of either sign, with white or 1/f noise or a converter '
-    "of 10 or 12 bits. Two thirds of the cases are labelled and follow the package's own program. "
-    'The others are one stretch each that starts anywhere. Each stage is identified from one '
-    'record, diagnosed on another, and judged on a third of other motion. An effect that would '
-    'change the identified G or H sets in behind the identification.\n\n'
+    'Every stage has two or three lightly damped modes and a delay of any fraction of a sample. '
+    'Rates are 10, 20 or 50 kHz, ranges 0..10, 0..100 or -20..130 V, strokes 5 to 200 um of '
+    'either sign. The noise is white, 1/f, or a converter of 10 or 12 bits. Two thirds of the '
+    "cases are labelled and follow the package's own program. The others are one stretch each "
+    'that starts anywhere. Each stage is identified from one record, diagnosed on another, and '
+    'judged on a third of other motion. An effect that would change the identified G or H sets in '
+    'behind the identification.\n\n'
     'The misfit of a core is the unseen error of the same stage without its effects, by forty '
-    'plays with the true linear part. The size of an effect is the rms of what it changes on the '
+    'plays with the true linear part. The size of an effect is the rms of its change of the '
     'diagnosis record, behind an offset and a gain, in % of stroke. Lines, channels and faults of '
-    'the data count whatever their size, other effects from the misfit on. A name is false where '
-    'it is neither true nor in a class that holds the truth.'
+    'the data count whatever their size, other effects from the misfit on. A name is false if '
+    'neither the name nor its class holds the truth.'
 )
 
 
