@@ -115,11 +115,11 @@ def main() -> None:
     text = [
         '# How well simulated stages are identified',
         '',
-        'This page shows how near the three steps come to known stages. `make study-identification`',
-        'made it. Errors are free-run errors against the noise-free stage,',
-        '100 rms(y - y_hat) / (max y - min y), on motions that were not fitted. The first motions',
-        'are the sines v = 5 + 5 sin(2 pi f t) in steady state. The others are minor loops at three',
-        'biases with a decaying triangle.',
+        'This page shows how near the three steps come to known stages. It was made by',
+        '`make study-identification`. Errors are free-run errors against the noise-free stage,',
+        '100 rms(y - y_hat) / (max y - min y), on motions that were not fitted: the sines',
+        'v = 5 + 5 sin(2 pi f t) in steady state, and minor loops at three biases with a decaying',
+        'triangle.',
         '',
         f'piezo_ident {__version__}, Python {platform.python_version()}, '
         f'numpy {np.__version__}, scipy {scipy.__version__}',
