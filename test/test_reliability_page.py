@@ -8,6 +8,7 @@ from pathlib import Path
 
 import build
 import pytest
+from rows import KEYS
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(build.ROWS.glob('*.json'))
@@ -24,7 +25,7 @@ def test_rows_have_all_they_need(path):
     assert rows
     for row in rows:
         # a study may keep more of its own beside
-        assert all(isinstance(row.get(key), str) and row[key].strip() for key in build.KEYS)
+        assert all(isinstance(row.get(key), str) and row[key].strip() for key in KEYS)
         words = row['command'].split()
         scripts = [w for w in words if w.endswith('.py')]
         assert scripts or words[0] == 'make', row['command']

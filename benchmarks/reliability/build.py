@@ -12,11 +12,13 @@ A study writes its own rows, a list of {what, how_often, result, command}, into
 
 from __future__ import annotations
 
+from itertools import groupby
 import json
+from operator import itemgetter
 import sys
 from typing import Any
 
-from rows import KEYS, ROWS
+from rows import ROWS
 
 PAGE = ROWS.parents[1] / 'reliability.md'
 #: studies in the order of the table; any other comes behind
@@ -93,13 +95,21 @@ Fast DDS below the slope's resolution and a clock of the machine that is set are
 """
 
 
+def _tried(rows: list[dict[str, Any]]) -> str:
+    """Return the attempts of one outcome and how often each; a subject that they share once."""
+    subject = rows[0]['what'].partition(': ')[0] + ': '
+    if len(rows) < 2 or not all(row['what'].startswith(subject) for row in rows):
+        subject = ''
+    each = (f'{row["what"].removeprefix(subject)} ({row["how_often"]})' for row in rows)
+    return subject + '; '.join(each)
+
+
 def page() -> str:
-    """Return the page."""
-    lines = ['| what was tried | how often | what happened | command |', '|---|---|---|---|']
-    for row in _rows():
-        cells = [_cell(row[key]) for key in KEYS]
-        cells[-1] = f'`{cells[-1]}`'
-        lines.append('| ' + ' | '.join(cells) + ' |')
+    """Return the page; attempts of one command with one outcome share a line."""
+    lines = ['| what was tried (how often) | what happened | command |', '|---|---|---|']
+    for (happened, command), rows in groupby(_rows(), itemgetter('result', 'command')):
+        cells = (_tried(list(rows)), happened, f'`{command}`')
+        lines.append(f'| {" | ".join(map(_cell, cells))} |')
     return HEAD + '\n'.join(lines) + '\n' + TAIL
 
 
