@@ -48,6 +48,16 @@ def key_of(run: Run) -> tuple[str, float]:
     return run.record, run.piece.start_time
 
 
+def fitted_memories(runs: Sequence[Run], model: StageModel) -> Memories:
+    """Collect the fitted memories at the starts of runs; runs that share a key have none."""
+    keys = [key_of(run) for run in runs]
+    return {
+        key: run.start(model.hysteresis.thresholds)
+        for key, run in zip(keys, runs, strict=True)
+        if run.memory is not None and keys.count(key) == 1
+    }
+
+
 def predictions_of(
     model: StageModel,
     runs: Sequence[Run],

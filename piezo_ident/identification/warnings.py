@@ -270,6 +270,26 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
     return found
 
 
+def warn_of_thresholds(held: Sequence[Excerpt], count: int | None) -> list[str]:
+    """Warn if no block of the triangle is held out, so that nothing chooses the thresholds."""
+    if count is not None or any(e.use.any() for e in held):
+        return []
+    return [
+        'the triangle turns too often to hold a part of it out: the number of thresholds '
+        f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
+    ]
+
+
+def warn_of_triangle(lowest: float, highest: float, scaling: Scaling) -> list[str]:
+    """Warn if the triangle, between two normalised voltages, does not cover the record."""
+    if lowest <= 0.01 and highest >= 0.99:
+        return []
+    return [
+        'the triangle does not cover the voltages of the record: it reaches '
+        f'{scaling.v(lowest):.3g} .. {scaling.v(highest):.3g} V'
+    ]
+
+
 def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:
     """Warn if the held-out parts leave the voltage range of the fitted parts."""
     pairs = list(zip(runs, fitted, strict=True))
