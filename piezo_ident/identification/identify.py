@@ -350,8 +350,8 @@ def first_steps(
         if not data.labelled:
             raise IdentificationError(_UNLABELLED.format('dynamics', 'noise and triangle'))
         delay = steps.delay or first_step(data.runs, settings, progress)
-        found = second_step(with_starts(data.runs), Delay(delay.samples), settings, progress)
-    return replace(steps, delay=delay, dynamics=found)
+        dynamics = second_step(with_starts(data.runs), Delay(delay.samples), settings, progress)
+    return replace(steps, delay=delay, dynamics=dynamics)
 
 
 def _provenance(

@@ -262,12 +262,12 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
     du = np.concatenate([np.gradient(p.run.u) for p in predictions])
     use = np.concatenate([p.run.use for p in predictions])
     bins = np.clip((u * BINS).astype(int), 0, BINS - 1)
-    found = np.full((2, BINS), np.nan)
-    for branch, there in zip(found, (use & (du > 0.0), use & (du < 0.0)), strict=True):
+    branches = np.full((2, BINS), np.nan)
+    for branch, there in zip(branches, (use & (du > 0.0), use & (du < 0.0)), strict=True):
         count = np.bincount(bins[there], minlength=BINS)
         total = np.bincount(bins[there], x[there], minlength=BINS)
         np.divide(total, count, out=branch, where=count > 0)
-    return found
+    return branches
 
 
 def warn_of_thresholds(held: Sequence[Excerpt], count: int | None) -> list[str]:

@@ -148,13 +148,13 @@ class _Problem:
 
     def errors(self, model: Dynamics) -> list[Array]:
         """Compute the free-run error of each stretch, without its mean."""
-        found = []
+        errors = []
         for s, used in zip(self.stretches, self.used, strict=True):
             e = filter_arx(model.a, model.b, s.u)
             np.subtract(s.x, e, out=e)
             e -= _mean(e, used)
-            found.append(e)
-        return found
+            errors.append(e)
+        return errors
 
     def loss(self, errors: Sequence[Array]) -> float:
         total = 0.0
