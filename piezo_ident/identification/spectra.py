@@ -166,7 +166,7 @@ def _response(
 
 
 def highest_frequency(u: Array, rate: float) -> float:
-    """Find the frequency [Hz] below which all but a millionth of the power of u - mean lies."""
+    """Find the frequency [Hz] below which all but a millionth of the moving power lies."""
     du = np.diff(u)
     if du.size == 0:
         return 0.0

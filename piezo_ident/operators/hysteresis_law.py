@@ -126,7 +126,6 @@ class HysteresisLaw:
 
         The columns are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2, then d_1 .. d_3
         of every rate.
-        every rate.
         """
         m = self.thresholds.size
         plays = np.zeros((m, POWERS + 2, m))

@@ -126,8 +126,8 @@ def _mean(x: Array, stretches: Stretches) -> float:
 
 
 def _past(x: Array, stretches: Stretches, count: int, negative: bool = False) -> Array:
-    # the stage was at rest before the record.  The level does not change the result, because the
-    # offsets are eliminated; without the level the sums lose no digits
+    # the stage counts as at rest before the record.  The level does not change the result, because
+    # the offsets are eliminated; without the level the sums lose no digits
     level = _mean(x, stretches)
     past = np.empty(count + x.size)
     if negative:
