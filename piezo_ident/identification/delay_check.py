@@ -34,7 +34,7 @@ SLACK = 0.05
 FOLLOWS = 0.5
 
 
-def upheld(result: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
+def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
     Choose the delay of steps or of the scan that the free run supports, else another delay.
 

@@ -20,7 +20,7 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.delay_check import upheld
+from piezo_ident.identification.delay_check import checked_delay
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.slow_part import fast_part
@@ -102,11 +102,11 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     has_noise = any(run.piece.find('noise') for run in runs)
     if step is not None and step.samples is not None:
         result = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
-        return _upheld(result, runs) if has_noise and not result.agree else result
+        return _checked_delay(result, runs) if has_noise and not result.agree else result
     if scan is None:
         result = DelayResult(MAX_DELAY, float('inf'), 'none', step, loss)
         if loss is not None and has_noise:
-            result = _upheld(result, runs)
+            result = _checked_delay(result, runs)
         if result.source != 'none':
             return result
         what = 'too short to scan' if loss is None else f'that hides it below {MAX_DELAY} samples'
@@ -118,10 +118,10 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     return DelayResult(scan, std, 'scan', step, loss, scan)
 
 
-def _upheld(result: DelayResult, runs: Sequence[Run]) -> DelayResult:
+def _checked_delay(result: DelayResult, runs: Sequence[Run]) -> DelayResult:
     run, start, stop = longest_noise(runs)
     noise = noise_segment(run, run.u, start, stop)
-    return upheld(result, noise.fitted, noise.held)
+    return checked_delay(result, noise.fitted, noise.held)
 
 
 def _scan(runs: Sequence[Run], kind: str) -> Array | None:
