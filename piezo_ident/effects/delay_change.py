@@ -28,9 +28,8 @@ class DelayChange(Effect):
     -----
     Possible cause: the buffer of a driver or the filter of a sensor was switched after the
     identification.  One sample at 20 kHz is 3.8 % of rms(y) at 120 Hz.  Linear interpolation is
-    the first of the Lagrange
-    fractional delays: T. I. Laakso, V. Valimaki, M. Karjalainen and U. K. Laine, "Splitting the
-    unit delay", IEEE Signal Process. Mag. 13(1), 1996, pp. 30-60.
+    the first of the Lagrange fractional delays: T. I. Laakso, V. Valimaki, M. Karjalainen and
+    U. K. Laine, "Splitting the unit delay", IEEE Signal Process. Mag. 13(1), 1996, pp. 30-60.
     """
 
     name = 'delay_change'

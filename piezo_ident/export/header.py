@@ -47,6 +47,8 @@ from piezo_ident.model.stage_model import StageModel
 FAR = 100.0
 #: width of a line of numbers or words [characters]
 WIDTH = 88
+#: reason of a header without a feed-forward, if the user wants none
+NOT_WANTED = 'it was not asked for'
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +130,7 @@ def export_c(
     front, linear, back = links_of(model)
     links = [*front.links, *linear.links, *back.links]
     channels = LinkGroup(links).channels
-    why, ff = 'it was not asked for', None
-    if feedforward:
-        try:
-            ff = _feedforward(model, kept, preview)
-        except ModelError as error:
-            why = str(error)
+    ff, why = _feedforward_or_reason(model, kept, preview) if feedforward else (None, NOT_WANTED)
     parts = {'front': front, 'linear': linear, 'back': back}
     if ff is not None and ff.part not in parts:
         parts[ff.part] = ff.front
@@ -158,16 +155,31 @@ def export_c(
         'helpers.h', still=c_number(STILL), tolerance=c_number(TOLERANCE), trials=TRIALS
     )
     if ff is not None:
-        # oldest first, as the past lies in memory
-        listed = ', '.join(repr(float(x)) for x in ff.taps[::-1])
-        values['feedforward'] = render(
-            'feedforward.h',
-            **values,
-            taps='\n'.join(textwrap.wrap(listed, WIDTH, break_on_hyphens=False)),
-            far=c_number(FAR),
-            short=c_number(SHORT),
-        )
+        values['feedforward'] = _feedforward_text(ff, values)
     return render('stage.h', **values, helpers=helpers)
+
+
+def _feedforward_or_reason(
+    model: StageModel, kept: tuple[float, float, float], preview: int | None
+) -> tuple[_FeedForward | None, str]:
+    """Invert a model for the template, or give the reason why it has no inverse."""
+    try:
+        return _feedforward(model, kept, preview), ''
+    except ModelError as error:
+        return None, str(error)
+
+
+def _feedforward_text(ff: _FeedForward, values: dict[str, Any]) -> str:
+    """Write the part of the header with the feed-forward."""
+    # oldest first, as the past lies in memory
+    listed = ', '.join(repr(float(x)) for x in ff.taps[::-1])
+    return render(
+        'feedforward.h',
+        **values,
+        taps='\n'.join(textwrap.wrap(listed, WIDTH, break_on_hyphens=False)),
+        far=c_number(FAR),
+        short=c_number(SHORT),
+    )
 
 
 def _feedforward(

@@ -34,20 +34,20 @@ SLACK = 0.05
 FOLLOWS = 0.5
 
 
-def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
+def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
     Choose the delay of steps or of the scan that the free run supports, else another delay.
 
     A delay holds if its free run errs no more than the best.  The smaller of two delays that hold
     is chosen.  If neither holds, half of the largest delay that holds is chosen.  A result without
-    source stays unchanged if the largest delay holds and a delay of 0 does not, or if no model
-    follows the noise.  `fitted` is input and output of noise, `held` the noise right behind it
-    that judges.
+    source stays unchanged if the largest delay holds, and either a delay of 0 does not or no
+    model follows the noise.  `fitted` is input and output of noise, `held` the noise right behind
+    it that judges.
     """
     # a result without source holds only the largest delay of the scan
-    told = found.samples if found.source != 'none' else None
-    asked = [d for d in (told, found.scan) if d is not None]
-    most = max(asked, default=found.samples)
+    told = result.samples if result.source != 'none' else None
+    asked = [d for d in (told, result.scan) if d is not None]
+    most = max(asked, default=result.samples)
     tried = sorted({*asked, most, *(d for d in DELAYS if d < most)})
     u, y = fitted
     factor = arx_factor(u, y, max(ORDERS), max(ORDERS) + tried[-1])
@@ -62,12 +62,12 @@ def upheld(found: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
     if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
         # the delay may be larger, or no model follows the noise
-        return found
+        return result
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
     if samples == told:
-        return found
-    if samples == found.scan:
+        return result
+    if samples == result.scan:
         # the loss was scanned in whole samples
-        return replace(found, samples=samples, std=0.5, source='scan')
+        return replace(result, samples=samples, std=0.5, source='scan')
     std = max(hold[-1], 1) / np.sqrt(12.0)
-    return replace(found, samples=samples, std=std, source='free run')
+    return replace(result, samples=samples, std=std, source='free run')

@@ -48,6 +48,16 @@ def key_of(run: Run) -> tuple[str, float]:
     return run.record, run.piece.start_time
 
 
+def fitted_memories(runs: Sequence[Run], model: StageModel) -> Memories:
+    """Collect the fitted memories at the starts of runs; runs that share a key have none."""
+    keys = [key_of(run) for run in runs]
+    return {
+        key: run.start(model.hysteresis.thresholds)
+        for key, run in zip(keys, runs, strict=True)
+        if run.memory is not None and keys.count(key) == 1
+    }
+
+
 def predictions_of(
     model: StageModel,
     runs: Sequence[Run],
@@ -55,7 +65,7 @@ def predictions_of(
     offsets: Mapping[tuple[str, float], float] | None = None,
 ) -> list[Prediction]:
     """Simulate each run freely; a memory at the start that is not given is estimated."""
-    static, found = model.without_dynamics(), []
+    static, predictions = model.without_dynamics(), []
     for run in runs:
         start: StartLike = (memories or {}).get(key_of(run))
         judged = run.use
@@ -67,8 +77,8 @@ def predictions_of(
         # a sensor may have been zeroed between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
         y_hat, y_static = (m.predict_piece(run.piece, start) + zero for m in (model, static))
-        found.append(Prediction(run, y_hat, y_static, judged))
-    return found
+        predictions.append(Prediction(run, y_hat, y_static, judged))
+    return predictions
 
 
 def errors_of(

@@ -73,13 +73,13 @@ def fit_free_run(
     stretches, guesses = _stretches(chosen, parts)
     search = _search(stretches, guesses, settings, progress)
     progress('delay', 1.0)
-    best, found = search.best()
+    best, candidates = search.best()
     progress('dynamics', 0.7)
     if settings.solver != 'swarm':
         # the swarm only finds the weights of a sum of plays
-        found += tuple(search.wider(best, _taus(stretches)))
-    best = search.at_rest(found)
-    found += (best,)
+        candidates += tuple(search.wider(best, _taus(stretches)))
+    best = search.at_rest(candidates)
+    candidates += (best,)
     progress('dynamics', 1.0)
     kept = _thinned(stretches)
     start = best.fit.stage
@@ -90,7 +90,7 @@ def fit_free_run(
     everything = _thinned([s.with_use(run.use) for s, run in zip(stretches, chosen, strict=True)])
     last = fit(judged.stage, everything, iterations=LAST)
     progress('hysteresis', 1.0)
-    fits = FreeRunFits(chosen, parts, judged, last, found, best)
+    fits = FreeRunFits(chosen, parts, judged, last, candidates, best)
     return outcome_of(fits, runs, rate, scaling, settings)
 
 
@@ -154,7 +154,7 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     order = [int(np.argmax(spans)), int(np.argmax(speeds))]
     order += sorted(range(len(windows)), key=lambda i: -spans[i] * speeds[i])
     chosen = sorted(dict.fromkeys(order), key=order.index)[:3]
-    found, count = [], 0
+    short_stretches, count = [], 0
     for number, i in enumerate(sorted(chosen)):
         s, part = windows[i]
         # windows are short: finer blocks allow more of them to be held out
@@ -166,8 +166,10 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
             before = remembered(s.u[: part.start + 1])
             # ringing from before the window is unknown
             use[: length // RINGING] = False
-        found.append(Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before))
-    return found
+        short_stretches.append(
+            Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before)
+        )
+    return short_stretches
 
 
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:

@@ -47,7 +47,7 @@ class FreeRunFits:
     chosen, parts : sequence
         Fitted runs, and the samples of each that were not held out.
     judged, last : Fit
-    found : sequence of Candidate
+    candidates : sequence of Candidate
         Candidates that were compared.
     best : Candidate
         Candidate that was chosen.
@@ -57,7 +57,7 @@ class FreeRunFits:
     parts: Sequence[Mask]
     judged: Fit
     last: Fit
-    found: Sequence[Candidate]
+    candidates: Sequence[Candidate]
     best: Candidate
 
 
@@ -151,7 +151,7 @@ def _hysteresis_result(fits: FreeRunFits, settings: Settings) -> HysteresisFit:
     if settings.solver == 'swarm':
         return _swarm(stage, fits.chosen, settings)
     errors: dict[str, float] = {}
-    for c in fits.found:
+    for c in fits.candidates:
         name = c.fit.stage.law.name
         errors[name] = min(float(np.sqrt(c.error)), errors.get(name, np.inf))
     whole = last.covariance()[: law.size, : law.size]
@@ -226,7 +226,7 @@ def _dynamics_result(fits: FreeRunFits, rate: float, band: float) -> DynamicsRes
         n = G.a.size + G.b.size
         covariance = last.covariance()[at : at + n, at : at + n]
     whole = float(np.std(np.concatenate([run.x[run.use] for run in runs])))
-    methods = {c.name: 100.0 * float(np.sqrt(c.error)) / whole for c in fits.found}
+    methods = {c.name: 100.0 * float(np.sqrt(c.error)) / whole for c in fits.candidates}
     return DynamicsResult(
         (0, 1) if G.is_static else (G.a.size, G.b.size),
         None,
@@ -262,7 +262,7 @@ def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) ->
 
 def _warn_of_creep(fits: FreeRunFits) -> list[str]:
     """Warn if creep lowers the error, but by less than an effect must."""
-    more = shown_effect(fits.found, fits.best)
+    more = shown_effect(fits.candidates, fits.best)
     if more is None:
         return []
     ours, theirs = (100.0 * float(np.sqrt(c.error)) for c in (fits.best, more))

@@ -87,7 +87,7 @@ def linear_starts(
     orders = allowed.orders(of)
     rate = stretches[0].rate
     sos = butter(2, HIGH_PASS * rate, 'highpass', fs=rate, output='sos')
-    found: dict[tuple[int, int], tuple[float, int, Dynamics]] = {}
+    best: dict[tuple[int, int], tuple[float, int, Dynamics]] = {}
     raw = [(w, s.x) for w, s in zip(inputs, stretches, strict=True)]
     for pairs in (
         [(w - w[0], x - x[0]) for w, x in raw],
@@ -97,9 +97,9 @@ def linear_starts(
     ):
         for (na, nb), d, G in _by_least_squares(pairs, stretches, orders, allowed.delays):
             left = _free_run_left(G, d, inputs, stretches)
-            if (na, nb) not in found or left < found[na, nb][0]:
-                found[na, nb] = left, d, G
-    return {order: (d, G) for order, (_, d, G) in found.items()}
+            if (na, nb) not in best or left < best[na, nb][0]:
+                best[na, nb] = left, d, G
+    return {order: (d, G) for order, (_, d, G) in best.items()}
 
 
 def _by_least_squares(
@@ -113,7 +113,7 @@ def _by_least_squares(
         for (w, x), s in zip(pairs, stretches, strict=True)
         for a, b in true_runs(s.use)
     ]
-    found = []
+    fits = []
     # a long order leaves short parts out; use the largest order for which a part is long enough
     for most in sorted({na for na, _ in orders}, reverse=True):
         lags = max(nb for na, nb in orders if na <= most) + max(delays) + 1
@@ -131,8 +131,8 @@ def _by_least_squares(
         for d in sorted(losses, key=lambda d: losses[d])[:NEAR]:
             G = stabilised(factor.dynamics(na, nb, d))
             if G.is_stable and 0.0 < G.gain < np.inf:
-                found.append(((na, nb), d, G))
-    return found
+                fits.append(((na, nb), d, G))
+    return fits
 
 
 def _free_run_left(
@@ -184,11 +184,11 @@ class Search:
         alone = self._hysteresis_alone()
         if self._starts_otherwise(self._candidate('hysteresis', alone)):
             return self._unknown_starts.best()
-        found = self._orders(alone)
-        best = best_of(found)
+        candidates = self._orders(alone)
+        best = best_of(candidates)
         if self._starts_otherwise(best):
             return self._unknown_starts.best()
-        return best, tuple(found)
+        return best, tuple(candidates)
 
     @property
     def _unknown_starts(self) -> Search:
@@ -201,16 +201,16 @@ class Search:
         free = self._candidate('free start', self._fit(stage, FEW), 1)
         return best_of([one, free]) is free
 
-    def at_rest(self, found: Sequence[Candidate]) -> Candidate:
+    def at_rest(self, candidates: Sequence[Candidate]) -> Candidate:
         """
         Choose the best candidate with starts at rest, if free starts do not lower its error.
 
         The starts were freed with an H of plays.  A wider law may need no memory from before.
         """
-        best = best_of(found)
+        best = best_of(candidates)
         if np.array_equal(best.fit.stage.guesses, self.guesses):
             return best
-        wide = [c for c in found if c.fit.stage.law.name in WIDER]
+        wide = [c for c in candidates if c.fit.stage.law.name in WIDER]
         rests = []
         for one in dict.fromkeys([best, *wide]):
             stage = replace(one.fit.stage, guesses=self.guesses, starts=self.guesses.copy())
@@ -221,28 +221,28 @@ class Search:
         return best if known is free else known
 
     def _orders(self, alone: Fit) -> list[Candidate]:
-        found = [self._candidate('hysteresis', alone)]
+        candidates = [self._candidate('hysteresis', alone)]
         rough = [alone, *self._rough([s.u for s in self.stretches], None)]
         rough += self._rough(self._inputs(alone.stage), alone.stage)
         first = min(rough, key=lambda one: one.loss)
         starts = linear_starts(self._inputs(first.stage), self.stretches, self.allowed, ORDERS)
         for (na, _), (d, G) in sorted(starts.items()):
             one = self._fit(_with_dynamics(first.stage, d, G), MANY)
-            found.append(self._candidate(f'order {na}', one))
-        return found + self._later(best_of(found))
+            candidates.append(self._candidate(f'order {na}', one))
+        return candidates + self._later(best_of(candidates))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
         """Fit candidates with creep, with wider laws of H, and with both."""
         stage = best.fit.stage
-        found = [self._more(best, 'creep', self._crept(stage, taus))]
+        creeping = [self._more(best, 'creep', self._crept(stage, taus))]
         laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
         wider = [self._more(best, law.name, stage.with_law(law)) for law in laws]
-        if shown_effect(found, best) is not None:
+        if shown_effect(creeping, best) is not None:
             law = min([best, *wider], key=lambda c: c.price).fit.stage.law
             if law.name in WIDER:
                 crept = self._crept(stage.with_law(law), taus)
-                found.append(self._more(best, f'{law.name}, creep', crept))
-        return [*found, *wider, *self._crept_before(found)]
+                creeping.append(self._more(best, f'{law.name}, creep', crept))
+        return [*creeping, *wider, *self._crept_before(creeping)]
 
     def _more(self, best: Candidate, name: str, stage: Stage) -> Candidate:
         effects = int(stage.taus.size > 0)
@@ -270,7 +270,7 @@ class Search:
 
     def _later(self, best: Candidate) -> list[Candidate]:
         """Drop the first coefficient of B for a sample of delay more, while the error falls."""
-        found: list[Candidate] = []
+        accepted: list[Candidate] = []
         one = best
         while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:
             stage = one.fit.stage
@@ -281,8 +281,8 @@ class Search:
             one = self._candidate(f'{best.name}, later', self._fit(start, FEW))
             if best_of([best, one]) is best:
                 break
-            found.append(one)
-        return found
+            accepted.append(one)
+        return accepted
 
     def _candidate(self, name: str, one: Fit, effects: int = 0) -> Candidate:
         return candidate(name, one, self.sets, self.kinds, effects)
@@ -322,7 +322,7 @@ class Search:
                 at(d)
 
     def _rough(self, inputs: Sequence[Array], stage: Stage | None) -> list[Fit]:
-        found = []
+        fits = []
         for d, G in linear_starts(inputs, self.stretches, self.allowed, ROUGH).values():
             start = (
                 Stage.linear(self.law, G, d, self.guesses)
@@ -330,11 +330,11 @@ class Search:
                 else _with_dynamics(stage, d, G)
             )
             try:
-                found.append(self._fit(start, FEW))
+                fits.append(self._fit(start, FEW))
             except IdentificationError:
                 # a start that diverges is dropped
                 continue
-        return found
+        return fits
 
 
 def _with_dynamics(stage: Stage, d: int, G: Dynamics) -> Stage:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-import platform
+from platform import python_version
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
     fast_error,
-    key_of,
+    fitted_memories,
     moves_on,
     noise_floor_of,
     Prediction,
@@ -40,6 +40,7 @@ from piezo_ident.identification.prepare import (
 )
 from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import (
+    DelayResult,
     DynamicsResult,
     FitOutcome,
     Identification,
@@ -51,7 +52,7 @@ from piezo_ident.identification.results import (
 from piezo_ident.identification.slow_part import without_pairs
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
-from piezo_ident.identification.step3_choice import PAPER_COUNT, third_step, WORTH
+from piezo_ident.identification.step3_choice import third_step, WORTH
 from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
 from piezo_ident.identification.three_steps import (
     beside_law,
@@ -63,14 +64,20 @@ from piezo_ident.identification.three_steps import (
     triangle_excerpts,
     within,
 )
-from piezo_ident.identification.warnings import warn_of_delay, warn_of_shape, warnings_of
+from piezo_ident.identification.warnings import (
+    warn_of_delay,
+    warn_of_shape,
+    warn_of_thresholds,
+    warn_of_triangle,
+    warnings_of,
+)
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.faults import without_faults
 from piezo_ident.record.record import Record, records_of
-import scipy
+from scipy import __version__ as scipy_version
 
 #: a model without a pair of poles and zeros that H may replace may err more by this share
 AS_WELL = 0.01
@@ -197,89 +204,24 @@ def _labelled(
     progress: Progress,
     steps: Steps,
 ) -> FitOutcome:
-    unstarted, runs = runs, with_starts(runs)
-    steps = steps.beside(settings.delay)
-    delay_result = steps.delay or first_step(runs, settings, progress)
+    started, steps = with_starts(runs), steps.beside(settings.delay)
+    delay_result = steps.delay or first_step(started, settings, progress)
     delay = Delay(delay_result.samples)
-
-    def fitted(dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
-        # fit the starts again with the lag of this G
-        runs = with_starts(unstarted, lag_of(G, delay))
-        fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-        small = small_excerpts(runs)
-        fitted_to: Sequence[Excerpt] = fit
-        hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
-        model = model_of(rate, scaling, hysteresis, G, delay)
-        if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
-            motion = motion_excerpts(runs)
-            other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
-            left = squares_left(model_of(rate, scaling, other, G, delay), runs)
-            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
-                hysteresis, fitted_to = other, motion
-        if hysteresis.law != 'plays':
-            # G was found with plays
-            refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
-            if refined is not None:
-                dynamics, G = refined
-                hysteresis = fit_again(hysteresis, fitted_to, G, delay)
-        model = model_of(rate, scaling, hysteresis, G, delay)
-        return _Fitted(runs, fit, held, dynamics, hysteresis, model, squares_left(model, runs))
-
-    best = fitted(*(steps.dynamics or second_step(runs, delay, settings, progress)), lean=False)
-    if without_pairs(best.model.dynamics, rate).a.size < best.model.dynamics.a.size:
-        sizes = [n for n in SMALLER if n < settings.max_order and not settings.order]
-        found = [best]
-        for size in (settings.max_order, *sizes):
-            of_size = replace(settings, max_order=size)
-            # no model of so low an order need be stable
-            with suppress(IdentificationError):
-                found.append(fitted(*second_step(runs, delay, of_size, progress, True), True))
-        # H may replace the pair, and large orders fit the error of H on the noise
-        limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in found)
-        best = next((one for one in reversed(found) if one.left < limit), best)
-    runs, fit, held, model = best.runs, best.fit, best.held, best.model
-    dynamics, hysteresis = best.dynamics, best.hysteresis
-    warnings: list[str] = []
-    missing: dict[str, str] = {}
-    is_given = delay_result.source == 'given'
-    without = replace(model.without_dynamics(), delay=delay if is_given else Delay(0))
-    left = squares_left(without, runs)
-    if best.left > left:
-        reason = (
-            f'with {"it" if is_given else "both"} the model errs {np.sqrt(best.left / left):.4g} '
-            'times as much on the data that choose as without; record noise of larger amplitude'
-        )
-        missing = dict.fromkeys(('dynamics',) if is_given else ('delay', 'dynamics'), reason)
-        delay_result = delay_result if is_given else delay_result.unknown
-        delay, G = without.delay, Dynamics.unit()
-        dynamics = replace(dynamics, order=(0, 1), covariance=np.zeros((1, 1)))
-        hysteresis = third_step(fit, held, G, delay, settings, progress)
-        model = model_of(rate, scaling, hysteresis, G, delay)
-    if settings.thresholds is None and not any(e.use.any() for e in held):
-        warnings.append(
-            'the triangle turns too often to hold a part of it out: the number of thresholds '
-            f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
-        )
-    warnings += warn_of_delay(delay_result)
-    lowest = min(e.span[0] for e in fit)
-    highest = max(e.span[1] for e in fit)
-    if lowest > 0.01 or highest < 0.99:
-        warnings.append(
-            'the triangle does not cover the voltages of the record: it reaches '
-            f'{scaling.v(lowest):.3g} .. {scaling.v(highest):.3g} V'
-        )
-        model = within(model, lowest, highest)
+    fitter = _LabelledFitter(runs, rate, scaling, settings, progress, delay)
+    second = steps.dynamics or second_step(started, delay, settings, progress)
+    best = fitter.without_pairs(fitter.fitted(*second, lean=False), started)
+    best, delay_result, missing = fitter.with_useful_dynamics(best, delay_result)
+    runs, model = best.runs, best.model
+    span = min(e.span[0] for e in best.fit), max(e.span[1] for e in best.fit)
+    warnings = [*warn_of_thresholds(best.held, settings.thresholds), *warn_of_delay(delay_result)]
+    if outside := warn_of_triangle(*span, scaling):
+        warnings += outside
+        model = within(model, *span)
     kinds = ('triangle', 'noise', 'settle', 'step')
     masks = [(run.mask(*kinds) & ~(out := run.held_out()), out) for run in runs]
-    memories = {
-        key_of(run): run.start(model.hysteresis.thresholds)
-        for run in runs
-        if run.memory is not None and sum(key_of(other) == key_of(run) for other in runs) == 1
-    }
-    return FitOutcome(
-        *(model, delay_result, dynamics, hysteresis, masks, warnings, tuple(missing.items())),
-        memories=memories,
-    )
+    results = model, delay_result, best.dynamics, best.hysteresis
+    memories = fitted_memories(runs, model)
+    return FitOutcome(*results, masks, warnings, tuple(missing.items()), memories)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,6 +235,82 @@ class _Fitted:
     hysteresis: HysteresisFit
     model: StageModel
     left: float
+
+
+@dataclass(frozen=True, eq=False)
+class _LabelledFitter:
+    """Third step on labelled runs, and its comparisons; the runs have no fitted starts yet."""
+
+    runs: Sequence[Run]
+    rate: float
+    scaling: Scaling
+    settings: Settings
+    progress: Progress
+    delay: Delay
+
+    def fitted(self, dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
+        """Fit the starts and H with this G; G is refined if H is not a sum of plays."""
+        settings, progress, delay = self.settings, self.progress, self.delay
+        # fit the starts again with the lag of this G
+        runs = with_starts(self.runs, lag_of(G, delay))
+        fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
+        small = small_excerpts(runs)
+        fitted_to: Sequence[Excerpt] = fit
+        hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
+        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
+        if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
+            motion = motion_excerpts(runs)
+            other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
+            left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
+            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
+                hysteresis, fitted_to = other, motion
+        if hysteresis.law != 'plays':
+            # G was found with plays
+            refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
+            if refined is not None:
+                dynamics, G = refined
+                hysteresis = fit_again(hysteresis, fitted_to, G, delay)
+        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
+        return _Fitted(runs, fit, held, dynamics, hysteresis, model, squares_left(model, runs))
+
+    def without_pairs(self, best: _Fitted, started: Sequence[Run]) -> _Fitted:
+        """Replace a model whose G holds pairs that H may replace, if a smaller G errs no more."""
+        G, settings = best.model.dynamics, self.settings
+        if without_pairs(G, self.rate).a.size == G.a.size:
+            return best
+        sizes = [n for n in SMALLER if n < settings.max_order and not settings.order]
+        candidates = [best]
+        for size in (settings.max_order, *sizes):
+            of_size = replace(settings, max_order=size)
+            # no model of so low an order need be stable
+            with suppress(IdentificationError):
+                second = second_step(started, self.delay, of_size, self.progress, lean=True)
+                candidates.append(self.fitted(*second, lean=True))
+        # H may replace the pair, and large orders fit the error of H on the noise
+        limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in candidates)
+        return next((one for one in reversed(candidates) if one.left < limit), best)
+
+    def with_useful_dynamics(
+        self, best: _Fitted, delay_result: DelayResult
+    ) -> tuple[_Fitted, DelayResult, dict[str, str]]:
+        """Drop G and the delay if the model errs less without them; the reasons by their names."""
+        is_given = delay_result.source == 'given'
+        delay = self.delay if is_given else Delay(0)
+        without = replace(best.model.without_dynamics(), delay=delay)
+        left = squares_left(without, best.runs)
+        if best.left <= left:
+            return best, delay_result, {}
+        reason = (
+            f'with {"it" if is_given else "both"} the model errs {np.sqrt(best.left / left):.4g} '
+            'times as much on the data that choose as without; record noise of larger amplitude'
+        )
+        missing = dict.fromkeys(('dynamics',) if is_given else ('delay', 'dynamics'), reason)
+        G = Dynamics.unit()
+        dynamics = replace(best.dynamics, order=(0, 1), covariance=np.zeros((1, 1)))
+        hysteresis = third_step(best.fit, best.held, G, delay, self.settings, self.progress)
+        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
+        best = replace(best, dynamics=dynamics, hysteresis=hysteresis, model=model)
+        return best, delay_result if is_given else delay_result.unknown, missing
 
 
 def first_steps(
@@ -332,8 +350,8 @@ def first_steps(
         if not data.labelled:
             raise IdentificationError(_UNLABELLED.format('dynamics', 'noise and triangle'))
         delay = steps.delay or first_step(data.runs, settings, progress)
-        found = second_step(with_starts(data.runs), Delay(delay.samples), settings, progress)
-    return replace(steps, delay=delay, dynamics=found)
+        dynamics = second_step(with_starts(data.runs), Delay(delay.samples), settings, progress)
+    return replace(steps, delay=delay, dynamics=dynamics)
 
 
 def _provenance(
@@ -354,11 +372,7 @@ def _provenance(
         'losses': {'model': fit.loss, 'swarm': fit.swarm_loss, 'optimum': fit.optimum_loss},
         'seed': result.settings.seed,
         'records': [record.name for record in records],
-        'versions': {
-            'python': platform.python_version(),
-            'numpy': np.__version__,
-            'scipy': scipy.__version__,
-        },
+        'versions': {'python': python_version(), 'numpy': np.__version__, 'scipy': scipy_version},
         'errors': {
             'unit': '% of stroke',
             'formula': FORMULA,

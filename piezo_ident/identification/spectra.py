@@ -166,7 +166,7 @@ def _response(
 
 
 def highest_frequency(u: Array, rate: float) -> float:
-    """Find the frequency [Hz] below which all but a millionth of the power of u - mean lies."""
+    """Find the frequency [Hz] below which all but a millionth of the moving power lies."""
     du = np.diff(u)
     if du.size == 0:
         return 0.0
@@ -241,13 +241,13 @@ def longest_noise(runs: Sequence[Run]) -> tuple[Run, int, int]:
 
     Raises IdentificationError if it is too short.
     """
-    found = [
+    stretches = [
         (stop - start, run, start, stop)
         for run in runs
         for s in run.piece.find('noise')
         for start, stop in run.unbroken(s.start, s.stop)
     ]
-    n, run, start, stop = max(found, key=lambda item: item[0])
+    n, run, start, stop = max(stretches, key=lambda item: item[0])
     if n < 2000:
         raise IdentificationError(
             f'{run.record}: the noise segment has {n} samples; at least 2000 are needed'

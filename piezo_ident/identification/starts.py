@@ -179,12 +179,12 @@ class _Starts:
         plain, *others = [
             [g if i in self.places else 0 for i in range(len(factors))] for g in numbers
         ]
-        found = []
+        candidates = []
         for places in [plain, *sorted(others, key=loss)[:STARTS]]:
             for i in self.sought if len(self.sought) > 1 else ():
                 places = min(([*places[:i], g, *places[i + 1 :]] for g in numbers), key=loss)
-            found.append(({i: guesses[places[i]] for i in self.sought}, fit(places)[0]))
-        return found
+            candidates.append(({i: guesses[places[i]] for i in self.sought}, fit(places)[0]))
+        return candidates
 
     def step(self, shares: Shares, weights: Array, prior: Shares) -> tuple[Array, Shares, float]:
         """Compute the next weights, the changes of the shares, and the loss before the step."""
@@ -287,19 +287,19 @@ def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
     excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
     driven = [i for i, e in enumerate(excerpts) if e.use.any()]
     unknown = [not bool(np.array_equal(runs[i].known, runs[i].use)) for i in driven]
-    found = list(runs)
+    fitted_runs = list(runs)
     rules = fit_starts([excerpts[i] for i in driven], unknown, lag)
     for i, rule in zip(driven, rules, strict=True):
         if rule is not None:
-            found[i] = replace(runs[i], memory=rule, known=runs[i].use)
-    return found
+            fitted_runs[i] = replace(runs[i], memory=rule, known=runs[i].use)
+    return fitted_runs
 
 
 def _rule(u0: float, r: Array, memory: Array) -> Rule:
     places, curve = np.concatenate([[0.0], r]), np.concatenate([[u0], memory])
 
     def rule(thresholds: Array) -> Array:
-        found = np.interp(thresholds, places, curve)
-        return np.asarray(np.clip(found, u0 - thresholds, u0))
+        outputs = np.interp(thresholds, places, curve)
+        return np.asarray(np.clip(outputs, u0 - thresholds, u0))
 
     return rule

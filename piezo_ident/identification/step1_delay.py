@@ -186,8 +186,8 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
             )
             for i in range(n)
         ]
-        found = np.array([s if s is not None else after for s, _, _ in left_out], dtype=float)
-        jackknife = np.sqrt((n - 1) / n * np.sum((found - found.mean()) ** 2))
+        delays = np.array([s if s is not None else after for s, _, _ in left_out], dtype=float)
+        jackknife = np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))
         std = max(std, float(jackknife))
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 

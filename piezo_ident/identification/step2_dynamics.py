@@ -96,15 +96,15 @@ class ArxFactor:
         R = np.asarray(np.linalg.qr(both, mode='r'))
         left = np.square(R[:, -1])
         size = np.abs(np.diag(R))
-        found = []
+        fits = []
         for p in range(na + 1, na + nb_max + 1):
             if size[:p].min() < INDEPENDENT:
-                found.append(self.fit(na, p - na, d))
+                fits.append(self.fit(na, p - na, d))
                 continue
             theta = solve_triangular(R[:p, :p], R[:p, -1], check_finite=False) / scale[:p]
             theta[:na] *= -1.0
-            found.append((theta, float(np.sum(left[p:])) / self.n))
-        return found
+            fits.append((theta, float(np.sum(left[p:])) / self.n))
+        return fits
 
 
 def arx_factor(u: Array, y: Array, na_max: int, n_lags: int) -> ArxFactor:

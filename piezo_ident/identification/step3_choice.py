@@ -100,11 +100,11 @@ def choose_thresholds(
     """
     Refine the thresholds until the held-out error stops falling.
 
-    The grid grows.  At each size the plays without weight are dropped, neighbours are merged, and
-    the merged thresholds replace the grid if their held-out error is as small.  `fit` and `held`
-    are the same runs in the same order with the fitted and the held-out samples.  `swing` is the
-    excited range of the normalised voltage.  `tick` is called with the share of the work done,
-    and may raise to stop it.
+    The grid grows.  At each size the plays without weight are dropped and neighbours are merged.
+    The merged thresholds compete with the grid by their held-out error, to which each threshold
+    adds 0.1 %.  `fit` and `held` are the same runs in the same order with the fitted and the
+    held-out samples.  `swing` is the excited range of the normalised voltage.  `tick` is called
+    with the share of the work done, and may raise to stop it.
     """
     best = even_thresholds(swing, COUNTS[0])
     best_loss, places = _held_loss(fit, held, best, dynamics, delay)
@@ -116,7 +116,7 @@ def choose_thresholds(
         candidates = [(loss, even)]
         if 1 < places.size < even.size:
             candidates.append((_held_loss(fit, held, places, dynamics, delay)[0], places))
-        # fewer thresholds win a tie
+        # the price of a threshold lets fewer of them win a tie
         loss, thresholds = min(
             candidates, key=lambda c: (c[0] * (1 + 1e-3 * c[1].size), c[1].size)
         )
@@ -219,8 +219,8 @@ def choose_law(
         return Choice(None)
     losses: dict[str, Array] = {}
     for i, (name, law) in enumerate(law_of.items()):
-        found = [fitted(_but(parts, j), law).coefficients for j in range(len(parts))]
-        both = zip(parts, found, strict=True)
+        coefficients = [fitted(_but(parts, j), law).coefficients for j in range(len(parts))]
+        both = zip(parts, coefficients, strict=True)
         losses[name] = np.array([_left_out(R, x, law, all_terms) for R, x in both])
         tick(0.3 + 0.7 * (i + 1) / len(LAWS))
     logs = {name: 0.5 * np.log(loss) for name, loss in losses.items()}

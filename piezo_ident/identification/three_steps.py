@@ -20,7 +20,7 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.delay_check import upheld
+from piezo_ident.identification.delay_check import checked_delay
 from piezo_ident.identification.prepare import Excerpt, Run
 from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
 from piezo_ident.identification.slow_part import fast_part
@@ -101,14 +101,14 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     progress('delay', 1.0)
     has_noise = any(run.piece.find('noise') for run in runs)
     if step is not None and step.samples is not None:
-        found = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
-        return _upheld(found, runs) if has_noise and not found.agree else found
+        result = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+        return _checked_delay(result, runs) if has_noise and not result.agree else result
     if scan is None:
-        found = DelayResult(MAX_DELAY, float('inf'), 'none', step, loss)
+        result = DelayResult(MAX_DELAY, float('inf'), 'none', step, loss)
         if loss is not None and has_noise:
-            found = _upheld(found, runs)
-        if found.source != 'none':
-            return found
+            result = _checked_delay(result, runs)
+        if result.source != 'none':
+            return result
         what = 'too short to scan' if loss is None else f'that hides it below {MAX_DELAY} samples'
         raise IdentificationError(
             f'delay: {no_step(step)}, and a drive {what}; add larger steps, or set --delay'
@@ -118,10 +118,10 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     return DelayResult(scan, std, 'scan', step, loss, scan)
 
 
-def _upheld(found: DelayResult, runs: Sequence[Run]) -> DelayResult:
+def _checked_delay(result: DelayResult, runs: Sequence[Run]) -> DelayResult:
     run, start, stop = longest_noise(runs)
     noise = noise_segment(run, run.u, start, stop)
-    return upheld(found, noise.fitted, noise.held)
+    return checked_delay(result, noise.fitted, noise.held)
 
 
 def _scan(runs: Sequence[Run], kind: str) -> Array | None:
@@ -203,7 +203,7 @@ def _orders(
             f'({settings.max_order}, {settings.max_order}) gave a stable model; '
             'is the noise segment really noise, and is the displacement its answer?'
         )
-    found = []
+    refined = []
     for i, (na, nb) in enumerate(orders):
         ls = factor.dynamics(na, nb, delay)
         iv = instrumental_variables(u, y, ls, delay)
@@ -215,11 +215,11 @@ def _orders(
         errors['output error'] = held_error(fit.dynamics)
         if np.isfinite(errors['output error']):
             result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
-            found.append((result, fit.dynamics))
+            refined.append((result, fit.dynamics))
         progress(0.5 + 0.5 * (i + 1) / len(orders))
-    if not found:
+    if not refined:
         raise IdentificationError('dynamics: no stable model was found; set --order')
-    return found
+    return refined
 
 
 def second_step(
@@ -256,8 +256,8 @@ def second_step(
     H = undo(G)
     progress('dynamics', 0.45)
     undone = noise_segment(run, run.through(H), start, stop)
-    found = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
-    result, G = _best_in_free_run(found, runs, H, delay, progress, lean)
+    candidates = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
+    result, G = _best_in_free_run(candidates, runs, H, delay, progress, lean)
     H = undo(G)
     tick = functools.partial(progress, 'dynamics', 0.85)
     fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
@@ -285,7 +285,7 @@ def second_step(
 
 
 def _best_in_free_run(
-    found: Sequence[tuple[DynamicsResult, Dynamics]],
+    candidates: Sequence[tuple[DynamicsResult, Dynamics]],
     runs: Sequence[Run],
     H: Hysteresis,
     delay: Delay,
@@ -296,10 +296,10 @@ def _best_in_free_run(
     # noise alone hardly shows a slow pole with a tiny residue; steps that were not fitted show it
     stretches, held = _stretches(runs, H, delay)
     rate = runs[0].piece.sample_rate
-    best, (result, G) = float('inf'), found[0]
+    best, (result, G) = float('inf'), candidates[0]
     G = fast_part(G, rate, lean)
-    for i, (candidate, start) in enumerate(found):
-        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(found))
+    for i, (candidate, start) in enumerate(candidates):
+        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(candidates))
         fast = fast_part(start, rate, lean)
         fit = output_error(stretches, fast, maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
@@ -307,7 +307,7 @@ def _best_in_free_run(
         if score < best / (1.0 + GAIN):
             best, result = score, candidate
             G = fast_part(fit.dynamics, rate, lean)
-        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(found))
+        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(candidates))
     return result, G
 
 

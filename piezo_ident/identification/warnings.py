@@ -262,12 +262,32 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
     du = np.concatenate([np.gradient(p.run.u) for p in predictions])
     use = np.concatenate([p.run.use for p in predictions])
     bins = np.clip((u * BINS).astype(int), 0, BINS - 1)
-    found = np.full((2, BINS), np.nan)
-    for branch, there in zip(found, (use & (du > 0.0), use & (du < 0.0)), strict=True):
+    branches = np.full((2, BINS), np.nan)
+    for branch, there in zip(branches, (use & (du > 0.0), use & (du < 0.0)), strict=True):
         count = np.bincount(bins[there], minlength=BINS)
         total = np.bincount(bins[there], x[there], minlength=BINS)
         np.divide(total, count, out=branch, where=count > 0)
-    return found
+    return branches
+
+
+def warn_of_thresholds(held: Sequence[Excerpt], count: int | None) -> list[str]:
+    """Warn if no block of the triangle is held out, so that nothing chooses the thresholds."""
+    if count is not None or any(e.use.any() for e in held):
+        return []
+    return [
+        'the triangle turns too often to hold a part of it out: the number of thresholds '
+        f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
+    ]
+
+
+def warn_of_triangle(lowest: float, highest: float, scaling: Scaling) -> list[str]:
+    """Warn if the triangle, between two normalised voltages, does not cover the record."""
+    if lowest <= 0.01 and highest >= 0.99:
+        return []
+    return [
+        'the triangle does not cover the voltages of the record: it reaches '
+        f'{scaling.v(lowest):.3g} .. {scaling.v(highest):.3g} V'
+    ]
 
 
 def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:

@@ -126,13 +126,8 @@ def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name
     raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
 
 
-def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
-    """
-    Build a model from the contents of a model file; messages contain the `name` of the file.
-
-    Raises ModelError if the schema is later than this package knows, or a part is missing or
-    wrong.
-    """
+def _check_layout(data: Mapping[str, Any], name: str) -> None:
+    """Refuse another schema, missing parts and unknown keys."""
     if 'several_axes' in data:
         raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
     version = data.get('schema_version', SCHEMA_VERSION)
@@ -154,12 +149,9 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     for part, keys in _INSIDE.items():
         check_keys(_part(data, part, name), keys, f' in {part}', name)
 
-    source, target = _part(data, 'input', name), _part(data, 'output', name)
-    delay, h = _part(data, 'delay', name), _part(data, 'hysteresis', name)
-    g = _part(data, 'dynamics', name)
-    limits = numbers(source, 'range', name)
-    if limits.size != 2:
-        raise ModelError(f'{name}: input.range must be [lowest, highest] voltage')
+
+def _effects(data: Mapping[str, Any], name: str) -> tuple[EffectSetting, ...]:
+    """Read the effects of a model."""
     effects = data.get('effects') or []
     if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
         raise ModelError(f'{name}: effects must be a list of mappings')
@@ -167,6 +159,29 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
         raise ModelError(f'{name}: {len(effects)} effects; give at most {EFFECTS}')
     for effect in effects:
         check_keys(effect, _EFFECT, ' in effects', name)
+    return tuple(
+        EffectSetting(
+            str(effect.get('name')),
+            {str(key): value for key, value in _part(effect, 'parameters', name).items()},
+        )
+        for effect in effects
+    )
+
+
+def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
+    """
+    Build a model from the contents of a model file; messages contain the `name` of the file.
+
+    Raises ModelError if the schema is later than this package knows, or a part is missing or
+    wrong.
+    """
+    _check_layout(data, name)
+    source, target = _part(data, 'input', name), _part(data, 'output', name)
+    delay, h = _part(data, 'delay', name), _part(data, 'hysteresis', name)
+    g = _part(data, 'dynamics', name)
+    limits = numbers(source, 'range', name)
+    if limits.size != 2:
+        raise ModelError(f'{name}: input.range must be [lowest, highest] voltage')
     identification = data.get('identification') or {}
     if not isinstance(identification, Mapping):
         raise ModelError(f'{name}: identification must be a mapping')
@@ -195,13 +210,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
             ),
             dynamics=Dynamics(a=a, b=b),
             delay=Delay(int(samples), number(delay, 'fraction', name, 0.0)),
-            effects=tuple(
-                EffectSetting(
-                    str(e.get('name')),
-                    {str(k): v for k, v in _part(e, 'parameters', name).items()},
-                )
-                for e in effects
-            ),
+            effects=_effects(data, name),
             identification=dict(identification),
         )
     except ModelError as error:

@@ -227,15 +227,15 @@ def _late(model: StageModel, piece: Piece, start: Start) -> int:
 
 def _on_starts(model: StageModel, record: Record, starts: Sequence[Start | None]) -> Iterator[str]:
     """Yield warnings about estimated motion before a record."""
-    found = [start for start in starts if start is not None]
-    elsewhere = sum(start.memory is not None for start in found)
+    estimates = [start for start in starts if start is not None]
+    elsewhere = sum(start.memory is not None for start in estimates)
     if elsewhere:
         yield (
             f'{record.name}: {elsewhere} of {len(starts)} pieces do not start at the '
             f'lowest voltage, {model.scaling.range[0]:g} V, or had not come down to it; the '
             'memory at their start is estimated from their early part'
         )
-    most = max((crept(model, start) for start in found), key=abs, default=0.0)
+    most = max((crept(model, start) for start in estimates), key=abs, default=0.0)
     if most:
         yield (
             f'{record.name}: creep of earlier motion goes on, by '

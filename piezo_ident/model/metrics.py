@@ -137,11 +137,11 @@ def worst_error(model: StageModel) -> float | None:
 
 def _known_errors(model: StageModel) -> Iterator[tuple[float, float]]:
     """Yield the errors in a model, the first to be quoted first, each with the worst error."""
-    found = model.identification
-    diagnosis = found.get('diagnosis')
+    origin = model.identification
+    diagnosis = origin.get('diagnosis')
     places = (
         (diagnosis.get('errors') if isinstance(diagnosis, Mapping) else None, ('after', 'before')),
-        (found.get('errors'), [kind.replace(' ', '_') for kind in KINDS]),
+        (origin.get('errors'), [kind.replace(' ', '_') for kind in KINDS]),
     )
     for errors, kinds in places:
         known = errors if isinstance(errors, Mapping) else {}

@@ -15,7 +15,7 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 
-#: time that is dropped at the start of a sine, which is at least one period [s]
+#: time that is dropped at the start of a sine [s]; at least one period is dropped
 SETTLING = 1.0
 
 _SINE = re.compile(r'sine:([0-9]+(?:\.[0-9]*)?(?:e[+-]?[0-9]+)?) ?Hz(?![^-_. ])', re.IGNORECASE)

@@ -165,7 +165,7 @@ class Dynamics:
             block = covariance[:na, :na]
         slope = np.polyder(np.concatenate([[1.0], self.a])) if na else np.zeros(1)
         rate = sample_rate / (2.0 * math.pi)
-        found = []
+        modes = []
         for pole in self.poles[self.poles.imag > 0.0]:
             s = np.log(pole)
             ds = -(pole ** np.arange(na - 1, -1, -1)) / np.polyval(slope, pole) / pole
@@ -173,8 +173,8 @@ class Dynamics:
             d_size = np.real(np.conj(s) * ds) / size
             d_damping = -ds.real / size + s.real * d_size / size**2
             std = [float(np.sqrt(np.maximum(d @ block @ d, 0.0))) for d in (d_size, d_damping)]
-            found.append(Mode(float(rate * size), rate * std[0], float(-s.real / size), std[1]))
-        return sorted(found, key=lambda mode: mode.frequency)
+            modes.append(Mode(float(rate * size), rate * std[0], float(-s.real / size), std[1]))
+        return sorted(modes, key=lambda mode: mode.frequency)
 
 
 def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:

@@ -126,7 +126,6 @@ class HysteresisLaw:
 
         The columns are q, c_1 .. c_3 and kappa of every play, then p0, p1 and p2, then d_1 .. d_3
         of every rate.
-        every rate.
         """
         m = self.thresholds.size
         plays = np.zeros((m, POWERS + 2, m))
@@ -208,7 +207,7 @@ class HysteresisLaw:
     def _parts(self) -> tuple[tuple[Hysteresis, Mask], ...]:
         r, m = self.thresholds, self.thresholds.size
         n = (POWERS + 2) * m
-        found = []
+        parts = []
         for row in self._parameters:
             plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
             moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
@@ -225,8 +224,8 @@ class HysteresisLaw:
                 span=self.span,
                 relaxations=np.column_stack([rates, lags])[chosen] if chosen.any() else None,
             )
-            found.append((part, moved))
-        return tuple(found)
+            parts.append((part, moved))
+        return tuple(parts)
 
     @functools.cached_property
     def slopes(self) -> Array:

@@ -4,7 +4,7 @@
 """A delay that steps or the loss tell, and what a free run over noise says of it."""
 
 import numpy as np
-from piezo_ident.identification.delay_check import upheld
+from piezo_ident.identification.delay_check import checked_delay
 from piezo_ident.identification.results import DelayResult
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
@@ -34,23 +34,23 @@ def split(u, y):
     [(5, 12, 5, 'steps'), (12, 4, 4, 'scan'), (6, 4, 4, 'scan'), (6, 5, 5, 'scan')],
 )
 def test_the_smaller_delay_that_holds_is_kept(steps, scan, samples, source):
-    found = upheld(DelayResult(steps, 0.3, 'steps', scan=scan), *noise(6))
+    found = checked_delay(DelayResult(steps, 0.3, 'steps', scan=scan), *noise(6))
     assert (found.samples, found.source) == (samples, source)
 
 
 def test_a_delay_that_no_free_run_allows_is_replaced_by_a_smaller_one():
-    found = upheld(DelayResult(40, 9.0, 'steps'), *noise(6))
+    found = checked_delay(DelayResult(40, 9.0, 'steps'), *noise(6))
     assert found.source == 'free run'
     assert 1 <= found.samples <= 6
     assert found.std > 1.0
 
 
 def test_noise_tells_a_delay_where_neither_steps_nor_the_loss_do():
-    found = upheld(DelayResult(30, np.inf, 'none'), *noise(6))
+    found = checked_delay(DelayResult(30, np.inf, 'none'), *noise(6))
     assert found.source == 'free run'
     assert 1 <= found.samples <= 6
     # where the delay is that long, nothing is claimed
-    assert upheld(DelayResult(30, np.inf, 'none'), *noise(33)).source == 'none'
+    assert checked_delay(DelayResult(30, np.inf, 'none'), *noise(33)).source == 'none'
 
 
 def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
@@ -59,10 +59,10 @@ def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
     y, some = filter_arx(np.array([-0.99]), np.array([0.01]), u), np.random.default_rng(1)
     y += 0.2 * y.std() * some.standard_normal(u.size)
     nothing = DelayResult(30, np.inf, 'none')
-    found = upheld(nothing, *split(u, y))
+    found = checked_delay(nothing, *split(u, y))
     assert found.source == 'free run'
     assert found.std > 5.0
     # where nothing follows the drive, nothing is claimed
     y += 5.0 * y.std() * some.standard_normal(u.size)
-    found = upheld(nothing, *split(u, y))
+    found = checked_delay(nothing, *split(u, y))
     assert found.source == 'none'

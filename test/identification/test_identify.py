@@ -545,7 +545,7 @@ def test_a_band_is_too_narrow_for_a_g_and_not_for_none(paper):
     unit = replace(narrow, model=replace(narrow.model, dynamics=Dynamics.unit()))
     for one, is_said in ((narrow, True), (jump, False), (unit, False)):
         said = warnings_of(one, [record], list(record))
-        assert any('what it does beyond' in x for x in said) == is_said
+        assert any('up to 1 Hz' in x for x in said) == is_said
 
 
 def test_nothing_is_refused():

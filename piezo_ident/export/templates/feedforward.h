@@ -11,7 +11,7 @@ typedef struct {
 {% endfor %}
 } {{ p }}_behind;
 
-/* what stands behind G and is inverted */
+/* operators behind G that are inverted */
 {% for what in ('rest', 'step') %}
 static inline double {{ p }}_behind_{{ what }}({{ p }}_behind *s, double x, double t, const double *channel)
 {

@@ -119,7 +119,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size
     fmi3Boolean final, fmi3Boolean *event, fmi3Boolean *end, fmi3Boolean *early, fmi3Float64 *last)
 {
     Instance *m = (Instance *)instance;
-    /* a time that rounding put just before a sample is that of the sample */
+    /* rounding may put the time of a sample just before it */
     const double due = floor((point + size - m->start) * {{ P }}_RATE + 1e-6);
     (void)final;
     set_inputs(m, &m->state);
@@ -166,7 +166,7 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference which[
     Instance *m = (Instance *)instance;
     size_t i;
     for (i = 0; i < n && i < n_values; i++) {
-        /* what is no finite number would stay in the memory of the model for ever */
+        /* a value that is not finite would stay in the memory of the model for ever */
         if (which[i] < VOLTAGE || which[i] >= VOLTAGE + INPUTS || values[i] - values[i] != 0.0)
             return fmi3Error;
         m->input[which[i] - VOLTAGE] = values[i];
@@ -225,7 +225,7 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance m, const fmi3Byte bytes[], size_
     return fmi3OK;
 }
 
-/* what the standard asks for and the model has not */
+/* functions that the standard demands and the model does not need */
 #define NONE(x) (void)m; (void)which; (void)n; (void)x;
 {% for type in ('Float32', 'Int8', 'UInt8', 'Int16', 'UInt16', 'Int32', 'UInt32', 'Int64', 'UInt64', 'Boolean', 'String') %}
 

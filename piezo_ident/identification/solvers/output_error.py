@@ -126,8 +126,8 @@ def _mean(x: Array, stretches: Stretches) -> float:
 
 
 def _past(x: Array, stretches: Stretches, count: int, negative: bool = False) -> Array:
-    # the stage was at rest before the record.  The level does not change the result, because the
-    # offsets are eliminated; without the level the sums lose no digits
+    # the stage counts as at rest before the record.  The level does not change the result, because
+    # the offsets are eliminated; without the level the sums lose no digits
     level = _mean(x, stretches)
     past = np.empty(count + x.size)
     if negative:
@@ -148,13 +148,13 @@ class _Problem:
 
     def errors(self, model: Dynamics) -> list[Array]:
         """Compute the free-run error of each stretch, without its mean."""
-        found = []
+        errors = []
         for s, used in zip(self.stretches, self.used, strict=True):
             e = filter_arx(model.a, model.b, s.u)
             np.subtract(s.x, e, out=e)
             e -= _mean(e, used)
-            found.append(e)
-        return found
+            errors.append(e)
+        return errors
 
     def loss(self, errors: Sequence[Array]) -> float:
         total = 0.0

@@ -42,7 +42,7 @@ def stand_out(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     >>> stand_out([Row(f'stage_{i}', {'gain': x}) for i, x in enumerate(gains, 1)])
     {'stage_8': {'gain': 5.0}}
     """
-    found: dict[str, dict[str, float]] = {}
+    medians: dict[str, dict[str, float]] = {}
     for column in (*COMPARED, *ABOVE):
         values = {
             row.record: float(x)
@@ -63,6 +63,6 @@ def stand_out(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
         for name, x in scaled.items():
             away = abs(x - middle) if column in COMPARED else x - middle
             if away > max(FAR * spread, least):
-                found.setdefault(name, {})[column] = statistics.median(values.values())
+                medians.setdefault(name, {})[column] = statistics.median(values.values())
     # in the order of the rows
-    return {row.record: found[row.record] for row in rows if row.record in found}
+    return {row.record: medians[row.record] for row in rows if row.record in medians}

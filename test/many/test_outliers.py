@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.each_command import _print
-from piezo_ident.many.odd import stand_out
+from piezo_ident.many.outliers import stand_out
 from piezo_ident.many.table import Row
 
 
