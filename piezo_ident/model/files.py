@@ -126,24 +126,29 @@ def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name
     raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
 
 
+def check_version(data: Mapping[str, Any], name: str, latest: int = SCHEMA_VERSION) -> None:
+    """Refuse a file of a later schema than the latest one with a ModelError."""
+    version = data.get('schema_version', latest)
+    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
+        raise ModelError(
+            f'{name}: schema_version must be a whole number, got {reprlib.repr(version)}'
+        )
+    if version > latest:
+        raise ModelError(
+            f'{name}: written with model schema {reprlib.repr(version)}, this package reads up to '
+            f'{latest}; update piezo_ident'
+        )
+
+
 def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     """
     Build a model from the contents of a model file, whose name serves messages.
 
     ModelError when the schema is later than this package knows, or a part is missing or wrong.
     """
-    if 'several_axes' in data:
+    if 'several_axes' in data or 'axes' in data:
         raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
-    version = data.get('schema_version', SCHEMA_VERSION)
-    if isinstance(version, bool) or not isinstance(version, int) or version < 1:
-        raise ModelError(
-            f'{name}: schema_version must be a whole number, got {reprlib.repr(version)}'
-        )
-    if version > SCHEMA_VERSION:
-        raise ModelError(
-            f'{name}: written with model schema {reprlib.repr(version)}, this package reads up to '
-            f'{SCHEMA_VERSION}; update piezo_ident'
-        )
+    check_version(data, name)
     missing = [key for key in _REQUIRED if key not in data]
     known = (*_REQUIRED, *_OPTIONAL)
     # a missing part may be there with its name misspelt; otherwise it is another kind of file
@@ -259,29 +264,24 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
 
 def model_to_yaml(model: StageModel) -> str:
     """Return the text of a model file."""
-    text: str = yaml.dump(
-        model_to_dict(model), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99
-    )
+    return yaml_text(model_to_dict(model))
+
+
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """Return plain data as YAML, lists of numbers on one line."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99)
     return text
 
 
 def load(path: str | os.PathLike[str]) -> StageModel:
     """
-    Read a model file.
+    Read a model file of one axis.
 
     Raises
     ------
     ConfigError
         When the file cannot be read or is not YAML.
     ModelError
-        When it is not a model, or one of a later schema.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
-    >>> model = pi.load('model.yaml')
-    >>> model.sample_rate, model.hysteresis.thresholds.size
-    (20000.0, 9)
+        When it is not a model of one axis, or one of a later schema.
     """
     return model_from_dict(load_yaml(path), str(path))

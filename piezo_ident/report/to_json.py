@@ -20,6 +20,7 @@ from piezo_ident.identification.results import DelayResult, DynamicsResult, Iden
 from piezo_ident.model import metrics
 from piezo_ident.model.files import finite, plain
 from piezo_ident.model.free_run import PieceRun
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
@@ -28,13 +29,17 @@ from piezo_ident.report.identification import headline
 VERSION = {'schema_version': 1, 'package_version': __version__}
 
 
-def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> dict[str, Any]:
+def to_json(
+    result: Identification | Diagnosis | EachAxis[Identification] | EachAxis[Diagnosis],
+    runs: Sequence[PieceRun] = (),
+) -> dict[str, Any]:
     """
     Return a result as plain data, ready for strict JSON.
 
     Parameters
     ----------
-    result : Identification or Diagnosis
+    result : Identification or Diagnosis, or EachAxis of them
+        Of several axes the key ``axes`` has the data of each.
     runs : sequence of PieceRun, optional
         For the steady-state errors of sines of an identification.
 
@@ -45,6 +50,8 @@ def to_json(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -
         finite is None; but a parameter of an effect that is infinite becomes the text ``inf`` or
         ``-inf``, and the overall error of a model that diverged the largest number there is.
     """
+    if isinstance(result, EachAxis):
+        return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
     data = _diagnosis(result) if isinstance(result, Diagnosis) else _identified(result, runs)
     return dict(finite(plain({**VERSION, **data})))
 
