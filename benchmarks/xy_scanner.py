@@ -6,8 +6,9 @@ How well a model of two axes predicts and tracks the raster of a scanner.
 
     python benchmarks/xy_scanner.py docs/xy_study.md --picture docs/images/xy_study.png
 
-The scanner has laws that are not the model's.  The first axis is a Preisach operator with an uneven
-density; the second obeys the law of Bouc and Wen, and creeps.  Either axis shakes the other.
+The scanner has laws that are not the model's.  The first axis is a Preisach operator with an
+uneven density; the second obeys the law of Bouc and Wen, and creeps.  Either axis shakes the
+other.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.report.figures import style
-from truths.linear import Cascade, delayed, RATE as FINE, relaxation
+from truths.linear import Cascade, delayed, relaxation
+from truths.linear import RATE as FINE
 
 #: sampling [Hz], stroke [m] and voltages [V] of either axis
 RATE, STROKE, LIMITS = 10_000.0, 50e-6, (0.0, 10.0)
@@ -77,15 +79,16 @@ segments:
 TEXT = """\
 # A raster of a simulated scanner
 
-`make study-xy` made this page. The scanner is simulated by laws that the model does not have: the first
-axis is a Preisach operator with an uneven density and a mode at 190 Hz; the second obeys the law of Bouc
-and Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either axis moves the other by {cross:g} %,
-through its own mode and one of the guide at 310 Hz. Both are sampled at {rate:g} kHz; the sensors have
-{noise:g} % of noise.
+`make study-xy` made this page. The scanner is simulated by laws that the model does not have: the
+first axis is a Preisach operator with an uneven density and a mode at 190 Hz; the second obeys
+the law of Bouc and Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either axis
+moves the other by {cross:g} %, through its own mode and one of the guide at 310 Hz. Both are
+sampled at {rate:g} kHz; the sensors have {noise:g} % of noise.
 
-One record of {seconds:.0f} s taught the model. Each axis played its three steps while the other one rested
-({learn:.0f} s, `pi.identify`); then both moved ({move:.0f} s, `pi.diagnose`). The raster took no part. It has
-lines of {lines:g} Hz and frames of {frames:g} Hz over {part:g} % of the range, for {length:g} s.
+One record of {seconds:.0f} s taught the model. Each axis played its three steps while the other
+one rested ({learn:.0f} s, `pi.identify`); then both moved ({move:.0f} s, `pi.diagnose`). The
+raster took no part. It has lines of {lines:g} Hz and frames of {frames:g} Hz over {part:g} % of
+the range, for {length:g} s.
 
 | axis | found | on held-out data before, after [%] |
 |---|---|---|
@@ -95,14 +98,14 @@ lines of {lines:g} Hz and frames of {frames:g} Hz over {part:g} % of the range, 
 
 *What the refined model errs by along the raster: prediction (top) and tracking (below).*
 
-The error is {formula}, the zero of the sensor included.
-*Predicted* is the free run from the voltages. *Tracked* is open loop: the scanner under the voltages of
-`pi.invert`, against the wanted motion, on the middle {middle:g} % of each line.
+The error is {formula}, the zero of the sensor included. *Predicted* is the free run from the
+voltages. *Tracked* is open loop: the scanner under the voltages of `pi.invert`, against the
+wanted motion, on the middle {middle:g} % of each line.
 
 {table}
 
-`pi.identify` took {identify:.0f} s and `pi.diagnose` {diagnose:.0f} s here, `pi.invert` {invert:.1f} s for
-{length:g} s of raster.
+`pi.identify` took {identify:.0f} s and `pi.diagnose` {diagnose:.0f} s here, `pi.invert`
+{invert:.1f} s for {length:g} s of raster.
 """
 
 
@@ -121,7 +124,7 @@ def cores() -> tuple[Core, Core]:
 
 
 def respond(v: Array, rng: np.random.Generator) -> Array:
-    """Return the displacements [m] under two voltages [V], shape (n, 2), from rest at the first."""
+    """Return the displacements [m] under voltages [V], shape (n, 2), from rest at the first."""
     fine = np.repeat(v / LIMITS[1], round(FINE / RATE), axis=0)
     # it has been driven before, so its loops are steady
     way = np.linspace(0.0, 1.0, 2000)
@@ -177,7 +180,9 @@ def triangle(frequency: float, length: float) -> Array:
     return np.asarray(1.0 - np.abs(1.0 - 2.0 * ((frequency * t) % 1.0)))
 
 
-def raster(fast: int, lines: float = LINES, frames: float = FRAMES, length: float = LENGTH) -> Array:
+def raster(
+    fast: int, lines: float = LINES, frames: float = FRAMES, length: float = LENGTH
+) -> Array:
     """Return a raster in parts of the range, shape (n, 2), times 10, from 0 by a soft ramp."""
     low = 0.5 * (1.0 - PART)
     ramp = low * 0.5 * (1.0 - np.cos(np.pi * np.linspace(0.0, 1.0, round(0.5 * RATE))))
@@ -219,7 +224,7 @@ def wanted_raster(model: pi.MultiAxisModel, fast: int) -> dict[str, Array]:
     """Return the raster as a motion of each axis [m], over the range that its voltages reach."""
     place = raster(fast) / 10.0
     goals = {}
-    for i, (axis, x) in enumerate(model.axes.items()):
+    for i, axis in enumerate(model.axes):
         up = np.linspace(*LIMITS, round(RATE))
         y = model.own(axis).simulate(np.concatenate([up, up[::-1]]))
         low, high = float(y[-1]), float(y[up.size - 1])
@@ -262,7 +267,8 @@ def picture(rows: list[Row]) -> Figure:
     """Draw what the model errs by, each axis as the fast one."""
     fig = style.figure(4.6)
     top, below = fig.subplots(2, 1)
-    for row, colour in zip([r for r in rows if r.is_fast], (style.BLUE, style.VERMILION), strict=True):
+    fast = [row for row in rows if row.is_fast]
+    for row, colour in zip(fast, (style.BLUE, style.VERMILION), strict=True):
         t = np.arange(row.predicted.size) / RATE
         top.plot(t, row.predicted, color=colour, linewidth=0.4, label=NAMES[row.axis])
         below.plot(
