@@ -280,27 +280,40 @@ def picture(rows: list[Row]) -> Figure:
     return fig
 
 
-def main() -> None:
-    """Write the page and its picture."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('out', type=Path)
-    parser.add_argument('--picture', type=Path)
-    args = parser.parse_args()
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """What one record taught: the model, a row of the table for each axis, and times [s]."""
+
+    model: pi.MultiAxisModel
+    found: list[str]
+    length: float
+    alone: float
+    identify: float
+    diagnose: float
+
+
+def teach() -> Taught:
+    """Identify and diagnose the scanner."""
     v, labels, start = learning()
-    whole = measured(v, np.random.default_rng(0), labels, 'scanner')
-    piece = whole.pieces[0]
+    piece = measured(v, np.random.default_rng(0), labels, 'scanner').pieces[0]
     begun = time.perf_counter()
     identified = pi.identify(Record((piece.cut(0, start),), 'one by one'))
     between = time.perf_counter()
     diagnosis = pi.diagnose(identified.model, Record((piece.cut(start, piece.n),), 'both'))
     end = time.perf_counter()
-    print(diagnosis)
+    print(identified, diagnosis, sep='\n\n')
     found = [
         f'| {NAMES[axis]} | {x.verdict}: {", ".join(e.name for e in x.effects) or "nothing"} | '
         f'{x.before.overall:.2f}, {x.after.overall:.2f} |'
         for axis, x in diagnosis.items()
     ]
-    results = [judged(diagnosis.model, fast) for fast in (0, 1)]
+    model = diagnosis.model
+    return Taught(model, found, piece.duration, start / RATE, between - begun, end - between)
+
+
+def write(taught: Taught, out: Path, drawn: Path | None) -> None:
+    """Judge a model, and write the page and its picture."""
+    results = [judged(taught.model, fast) for fast in (0, 1)]
     rows = [row for some, _ in results for row in some]
     head = f'| axis | it is | predicted | tracked | asked |\n|{"---|" * 5}\n'
     page = {
@@ -308,24 +321,33 @@ def main() -> None:
         'cross': 100 * CROSS,
         'rate': RATE / 1e3,
         'noise': 100 * NOISE,
-        'seconds': piece.duration,
-        'learn': start / RATE,
-        'move': piece.duration - start / RATE,
+        'seconds': taught.length,
+        'learn': taught.alone,
+        'move': taught.length - taught.alone,
         'lines': LINES,
         'frames': FRAMES,
         'part': 100 * PART,
         'length': LENGTH,
         'middle': 100 * MIDDLE,
         'formula': FORMULA,
-        'found': '\n'.join(found),
+        'found': '\n'.join(taught.found),
         'table': head + '\n'.join(row.cells() for row in rows),
-        'identify': between - begun,
-        'diagnose': end - between,
+        'identify': taught.identify,
+        'diagnose': taught.diagnose,
         'invert': results[0][1],
     }
-    args.out.write_text(TEXT.format(**page))
-    if args.picture is not None:
-        picture(rows).savefig(args.picture, dpi=style.DPI)
+    out.write_text(TEXT.format(**page))
+    if drawn is not None:
+        picture(rows).savefig(drawn, dpi=style.DPI)
+
+
+def main() -> None:
+    """Write the page and its picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('out', type=Path)
+    parser.add_argument('--picture', type=Path)
+    args = parser.parse_args()
+    write(teach(), args.out, args.picture)
 
 
 if __name__ == '__main__':

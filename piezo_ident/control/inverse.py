@@ -133,49 +133,20 @@ def invert(
     like: Inverse | None = None,
 ) -> Inverse:
     """
-    Return the voltage under which a model moves as wanted.
+    Return the voltage under which a model of one axis moves as wanted; see `piezo_ident.invert`.
 
     Parameters
     ----------
-    model : StageModel
-    wanted : array_like, shape (n,)
-        Displacement [m], sampled at the rate of the model.  Before and after it the stage rests,
-        at its beginning as one that came there from its lowest voltage in one stroke and has
-        settled: with creep, better begin where nothing creeps.
     limits : tuple of float, optional
         Lowest and highest voltage [V]; the identified range when absent.
     slew : float, optional
         Largest speed of the voltage [V/s].
     clip : bool, optional
         Come as near as the limits allow, instead of refusing.
-    channels : mapping of str to array_like, shape (n,), optional
-        Further signals that effects of the model depend on.
     sample_rate : float, optional
         Of the wanted motion [Hz], where that is known: another one than the model's is refused.
     like : Inverse, optional
         Of nearly the same motion, to begin with where plays widen with speed.
-
-    Returns
-    -------
-    Inverse
-
-    Raises
-    ------
-    DataError
-        When the wanted motion is no vector of finite numbers, or the limits do not reach it.
-    ModelError
-        When the model has no inverse.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import piezo_ident as pi
-    >>> model = pi.SimulatedStage.load('paper').model
-    >>> t = np.arange(4000) / model.sample_rate
-    >>> wanted = 30e-6 * (1 - np.cos(2 * np.pi * 10 * t)) + 5e-6
-    >>> drive = pi.invert(model, wanted)
-    >>> drive.error < 0.01, bool(0 <= drive.v.min() and drive.v.max() <= 10)
-    (True, True)
     """
     y = checked_motion(wanted)
     if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):

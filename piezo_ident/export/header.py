@@ -75,13 +75,10 @@ def export_c(
     feedforward: bool = True,
 ) -> str:
     """
-    Return a model as a C header: prediction and feed-forward, sample by sample.
+    Return a model of one axis as a C header; see `piezo_ident.export_c`.
 
     Parameters
     ----------
-    model : StageModel
-    name : str, optional
-        With which all names in the header begin.
     limits : tuple of float, optional
         Lowest and highest voltage of the feed-forward [V]; the identified range when absent.
     slew : float, optional
@@ -92,28 +89,6 @@ def export_c(
         First line of the header.
     feedforward : bool, optional
         Whether the header has a feed-forward.
-
-    Returns
-    -------
-    str
-        C99 without dependencies; a comment at its head says how to call it, and what the
-        feed-forward does not make up for.
-
-    Raises
-    ------
-    DataError
-        When it is given no model, or limits or slew are impossible.
-    ConfigError
-        When the name is none in C.
-    ModelError
-        When an effect of the model is not written in C, or the preview is shorter than its delay.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> header = pi.export_c(pi.SimulatedStage.load('paper').model, limits=(0.0, 10.0))
-    >>> 'static inline double stage_step(stage_state *s, double v)' in header
-    True
     """
     expect(model, StageModel, 'export, first argument', 'read a model with load')
     if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):

@@ -90,42 +90,7 @@ def identify(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
-    """
-    Learn a stage from its records.
-
-    Parameters
-    ----------
-    records : sequence of Record, or Record
-        With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
-        of other kinds are then left for validation.  Without them every run is fitted in one
-        go, but for what is held out.
-    settings : Settings, optional
-    validation : sequence of Record, or Record, optional
-        Records that are neither fitted nor looked at; the headline is about them.
-    progress : callable, optional
-        Called with the name of the step and its share done; may raise `Cancelled`.
-    steps : Steps, optional
-        Steps of the three that were taken already, from `first_steps`; where they are given,
-        even empty ones, records without labelled segments are refused.
-
-    Returns
-    -------
-    Identification
-
-    Raises
-    ------
-    IdentificationError
-        When the data do not carry a model; the message says what they lack.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
-    >>> record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0)
-    >>> result = pi.identify(record, pi.Settings(thresholds=4))
-    >>> bool(result.headline.percent < 0.1)
-    True
-    """
+    """Learn a stage of one axis; see `piezo_ident.identify`."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
     expect(settings, Settings, 'identify, settings', 'give several records as a list')

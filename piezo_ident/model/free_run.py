@@ -115,37 +115,7 @@ class FreeRun(Showable):
 
 
 def free_run(model: StageModel, record: Record) -> FreeRun:
-    """
-    Predict a record in free run, and compare it with what was measured.
-
-    A record that does not start at the lowest voltage starts from an unknown memory, which is
-    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
-    shows.  Nothing is fitted to the samples after that part.
-
-    Parameters
-    ----------
-    model : StageModel
-    record : Record
-        Its displacement serves only the estimate and the errors.
-
-    Raises
-    ------
-    ModelError
-        When a piece has another sampling rate than the model, or the prediction overflows.
-    DataError
-        When the record holds no displacement; `StageModel.simulate` needs none.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> stage = pi.SimulatedStage.load('paper')
-    >>> record = stage.play(pi.Program.load('minor_loops'))
-    >>> run = pi.free_run(stage.model, record)
-    >>> run.predicted.shape == run.measured.shape
-    True
-    >>> run.errors.percent < 0.01
-    True
-    """
+    """Predict a record with a model of one axis; see `piezo_ident.free_run`."""
     expect(model, StageModel, 'free_run, first argument', 'read a model with load')
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     record.require_displacement()
