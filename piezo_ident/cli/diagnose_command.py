@@ -55,10 +55,11 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
+    of_axes = {'y': given} if isinstance(given, StageModel) else given.axes
     if isinstance(diagnosis, EachAxis):
-        diagnosis = diagnosis.mapped(lambda _, x: _named(x, records))
+        diagnosis = diagnosis.mapped(lambda axis, x: _named(x, of_axes[axis], records))
     else:
-        diagnosis = _named(diagnosis, records)
+        diagnosis = _named(diagnosis, of_axes['y'], records)
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
@@ -93,9 +94,9 @@ def _changes(diagnosis: Diagnosis | EachAxis[Diagnosis]) -> str:
     return '; '.join(': '.join(text) for text in texts if text[-1])
 
 
-def _named(diagnosis: Diagnosis, records: Sequence[Record]) -> Diagnosis:
+def _named(diagnosis: Diagnosis, given: StageModel, records: Sequence[Record]) -> Diagnosis:
     """Return a diagnosis that warns of records from which the model was identified."""
-    told = _of_names(diagnosis.given, records)
+    told = _of_names(given, records)
     return replace(diagnosis, warnings=(*told, *diagnosis.warnings))
 
 
