@@ -62,7 +62,7 @@ segments:
   - {signal: idle, duration: 0.3}
 """
 #: both axes, the second so much later [s]
-LATER = 7.0
+LATER = 5.0
 MOVING = """
 limits: [0, 10]
 slew: 40
@@ -162,7 +162,7 @@ def learning() -> tuple[Array, tuple[Segment, ...], int]:
         np.stack([alone.v, rest], axis=1),
         np.stack([rest, alone.v], axis=1),
         np.stack([np.append(both.v, later), np.append(later, both.v)], axis=1),
-        *(np.pad(raster(axis, 7.0, 0.3, 4.0), ((0, 5000), (0, 0))) for axis in (0, 1)),
+        *(_there_and_back(raster(axis, 7.0, 0.3, 3.0)) for axis in (0, 1)),
     ]
     labels = [
         Segment(s.label, s.start + shift, s.stop + shift)
@@ -172,6 +172,12 @@ def learning() -> tuple[Array, tuple[Segment, ...], int]:
     # what rests at the end of the one rests at the beginning of the other
     labels = [s for s in labels if s.kind != 'idle']
     return np.concatenate(parts), tuple(labels), 2 * alone.n
+
+
+def _there_and_back(v: Array) -> Array:
+    """Return voltages with a soft way to zero at the end."""
+    way = 0.5 * (1.0 + np.cos(np.pi * np.linspace(0.0, 1.0, round(0.5 * RATE))))
+    return np.concatenate([v, v[-1] * way[:, None]])
 
 
 def triangle(frequency: float, length: float) -> Array:
