@@ -17,7 +17,7 @@ MADE := .venv/.made$(if $(SOURCED),-sourced)
 
 .PHONY: any-record attack docs netns soak
 .PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash limits mirror study table-one clean distclean
+.PHONY: crash limits mirror study study-xy table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -77,6 +77,10 @@ study-identification: .venv/.demo
 track: .venv/.demo
 	.venv/bin/python benchmarks/study_tracking.py docs/tracking.md \
 	    --picture docs/images/tracking.png
+
+# how well the raster of a simulated scanner is predicted and tracked: ten minutes
+study-xy: .venv/.demo
+	.venv/bin/python benchmarks/xy_scanner.py docs/xy_study.md --picture docs/images/xy_study.png
 
 # what a measured fast steering mirror has and a linear model lacks: under ten minutes; the records
 # are read from ../shared/data/fsm, or from fsm in PIEZO_IDENT_DATA

@@ -31,19 +31,16 @@ if TYPE_CHECKING:
         ModelError,
         PiezoIdentError,
     )
-    from piezo_ident.control.inverse import Inverse, invert
+    from piezo_ident.control.inverse import Inverse
     from piezo_ident.control.learning import Learning
     from piezo_ident.control.live_inverse import LiveInverse
-    from piezo_ident.diagnosis.diagnose import diagnose
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
     from piezo_ident.export.fmu import export_fmu
-    from piezo_ident.export.header import export_c
-    from piezo_ident.identification.identify import identify
     from piezo_ident.identification.results import Identification, Settings
     from piezo_ident.live.guard import Guard, GuardSettings
-    from piezo_ident.model.files import load
-    from piezo_ident.model.free_run import free_run, FreeRun
+    from piezo_ident.model.free_run import FreeRun
+    from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
     from piezo_ident.model.two_axis_stage import TwoAxisStage
@@ -51,6 +48,9 @@ if TYPE_CHECKING:
     from piezo_ident.record.io import read, write
     from piezo_ident.record.record import Record
     from piezo_ident.report.folder import write_report
+    from piezo_ident.verbs.export import export_c
+    from piezo_ident.verbs.learn import diagnose, identify
+    from piezo_ident.verbs.use import free_run, invert, MultiAxisInverse
 
 __version__ = '0.1.0'
 
@@ -63,6 +63,7 @@ _HOMES = {
     'DataError': 'common.errors',
     'Diagnosis': 'diagnosis.results',
     'DiagnosisSettings': 'diagnosis.results',
+    'EachAxis': 'model.multi_axis',
     'FreeRun': 'model.free_run',
     'Guard': 'live.guard',
     'GuardSettings': 'live.guard',
@@ -72,6 +73,8 @@ _HOMES = {
     'Learning': 'control.learning',
     'LiveInverse': 'control.live_inverse',
     'ModelError': 'common.errors',
+    'MultiAxisInverse': 'verbs.use',
+    'MultiAxisModel': 'model.multi_axis',
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
     'Record': 'record.record',
@@ -79,15 +82,15 @@ _HOMES = {
     'SimulatedStage': 'model.simulated_stage',
     'StageModel': 'model.stage_model',
     'TwoAxisStage': 'model.two_axis_stage',
-    'diagnose': 'diagnosis.diagnose',
+    'diagnose': 'verbs.learn',
     'effects': 'effects',
-    'export_c': 'export.header',
+    'export_c': 'verbs.export',
     'export_fmu': 'export.fmu',
-    'free_run': 'model.free_run',
-    'identify': 'identification.identify',
+    'free_run': 'verbs.use',
+    'identify': 'verbs.learn',
     'identify_axes': 'axes.from_records',
-    'invert': 'control.inverse',
-    'load': 'model.files',
+    'invert': 'verbs.use',
+    'load': 'model.multi_axis',
     'read': 'record.io',
     'report': 'report',
     'write': 'record.io',
@@ -102,6 +105,7 @@ __all__ = [
     'DataError',
     'Diagnosis',
     'DiagnosisSettings',
+    'EachAxis',
     'FreeRun',
     'Guard',
     'GuardSettings',
@@ -111,6 +115,8 @@ __all__ = [
     'Learning',
     'LiveInverse',
     'ModelError',
+    'MultiAxisInverse',
+    'MultiAxisModel',
     'PiezoIdentError',
     'Program',
     'Record',

@@ -39,6 +39,7 @@ ROOMS = (
     'diagnosis',
     'control',
     'export',
+    'verbs',
     'live',
     'report',
     'many',

@@ -22,13 +22,14 @@ from piezo_ident.cli.identify_command import (
 )
 from piezo_ident.cli.records import check_order, fields_of
 from piezo_ident.common.errors import ConfigError, naming
-from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
-from piezo_ident.model.files import load
 from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.multi_axis import EachAxis, load
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis_text, to_json, validated
+from piezo_ident.verbs.learn import diagnose
 
 
 def diagnose_command(args: SimpleNamespace, console: Console) -> None:
@@ -54,21 +55,49 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
-    diagnosis = replace(diagnosis, warnings=(*_of_names(given, records), *diagnosis.warnings))
+    of_axes = {'y': given} if isinstance(given, StageModel) else given.axes
+    if isinstance(diagnosis, EachAxis):
+        diagnosis = diagnosis.mapped(lambda axis, x: _named(x, of_axes[axis], records))
+    else:
+        diagnosis = _named(diagnosis, of_axes['y'], records)
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
-    note = ', '.join(diagnosis.changes) or f'the same as {args.model_file}, nothing changed'
+    note = _changes(diagnosis) or f'the same as {args.model_file}, nothing changed'
     files = print_files(args, console, f' ({note})')
     steps = print_next(diagnosis, prompt, console)
     console.result(
         {
             **to_json(diagnosis),
-            'validation': [{'formula': FORMULA, **asdict(x)} for x in diagnosis.unseen],
+            'validation': [
+                {'formula': FORMULA, **axis, **asdict(x)}
+                for axis, one in _of_each(diagnosis)
+                for x in one.unseen
+            ],
             'files': files,
             'next': steps,
         }
     )
+
+
+def _of_each(
+    diagnosis: Diagnosis | EachAxis[Diagnosis],
+) -> list[tuple[dict[str, str], Diagnosis]]:
+    """Return the diagnoses, each with the name of its axis where there are several."""
+    if isinstance(diagnosis, EachAxis):
+        return [({'axis': axis}, x) for axis, x in diagnosis.items()]
+    return [({}, diagnosis)]
+
+
+def _changes(diagnosis: Diagnosis | EachAxis[Diagnosis]) -> str:
+    texts = [(*axis.values(), ', '.join(x.changes)) for axis, x in _of_each(diagnosis)]
+    return '; '.join(': '.join(text) for text in texts if text[-1])
+
+
+def _named(diagnosis: Diagnosis, given: StageModel, records: Sequence[Record]) -> Diagnosis:
+    """Return a diagnosis that warns of records from which the model was identified."""
+    told = _of_names(given, records)
+    return replace(diagnosis, warnings=(*told, *diagnosis.warnings))
 
 
 def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:

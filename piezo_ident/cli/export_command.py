@@ -14,8 +14,8 @@ from piezo_ident.cli.outputs import check_output
 from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.common.files import write_text
 from piezo_ident.export.fmu import export_fmu
-from piezo_ident.export.header import export_c
-from piezo_ident.model.files import load
+from piezo_ident.model.multi_axis import load, MultiAxisModel
+from piezo_ident.verbs.export import export_c
 
 SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
@@ -49,6 +49,10 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
             write_text(args.out, header)
             known = (f'{name}_step', f'{name}_feedforward_step')
             functions = [function for function in known if f'{function}(' in header]
+        elif isinstance(model, MultiAxisModel):
+            raise ConfigError(
+                f'{args.model}: has several axes; an FMU holds one, write a header .h'
+            )
         else:
             export_fmu(model, args.out, name)
     console.say(' '.join([f'wrote {args.out}', *([f'with {", ".join(functions)}'] * is_header)]))

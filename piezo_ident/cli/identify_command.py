@@ -18,18 +18,19 @@ from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.each_command import check_each, identify_each
 from piezo_ident.cli.options import READING
 from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
-from piezo_ident.cli.predict_command import error_data, print_errors
+from piezo_ident.cli.predict_command import print_run
 from piezo_ident.cli.records import expand_apart, fields_of, MODEL_FILES, read_all
 from piezo_ident.common.errors import ConfigError, DataError, naming
-from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
-from piezo_ident.model.free_run import free_run
-from piezo_ident.model.sines import sine_errors
+from piezo_ident.model.multi_axis import EachAxis
+from piezo_ident.model.sines import sine_errors, SineError
 from piezo_ident.record.record import Record
+from piezo_ident.verbs.learn import identify
+from piezo_ident.verbs.use import free_run
 
 if TYPE_CHECKING:
     from piezo_ident.report import Prompt
+    from piezo_ident.report.folder import Results
 
 
 def identify_command(args: SimpleNamespace, console: Console) -> None:
@@ -50,19 +51,17 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
     console.say(report.identification_text(result))
     checks = []
     for record in validation:
-        run = free_run(result.model, record)
-        sines = sine_errors(result.model, record) if record.find('sine') else ()
-        checks.append(
-            {**error_data(run), 'record': record.name, 'sines': list(map(asdict, sines))}
-        )
+        sines: tuple[SineError, ...] = ()
+        if not isinstance(result, EachAxis) and record.find('sine'):
+            sines = sine_errors(result.model, record)
         console.say(f'\n{record.name}, not fitted:')
-        print_errors(run, console)
+        data = print_run(free_run(result.model, record), console)
+        checks.append({**data, 'record': record.name, 'sines': list(map(asdict, sines))})
         if sines:
             console.say(f'\n{report.table_one(sines)}')
     files = print_files(args, console)
     steps = print_next(result, prompt, console)
-    data = {**report.to_json(result), 'validation': checks, 'files': files, 'next': steps}
-    console.result(data)
+    console.result({**report.to_json(result), 'validation': checks, 'files': files, 'next': steps})
 
 
 def checked(
@@ -126,9 +125,7 @@ def _words(value: Any) -> list[str]:
     return [f'{x:g}' if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist()]
 
 
-def print_next(
-    result: Identification | Diagnosis, prompt: Prompt, console: Console
-) -> list[dict[str, str]]:
+def print_next(result: Results, prompt: Prompt, console: Console) -> list[dict[str, str]]:
     """Print what to do next by its command lines, and return that for programs."""
     from piezo_ident.report import next_steps
 
@@ -141,7 +138,7 @@ def print_next(
     return [asdict(step) for step in steps]
 
 
-def keep(result: Identification | Diagnosis, args: SimpleNamespace, prompt: Prompt) -> None:
+def keep(result: Results, args: SimpleNamespace, prompt: Prompt) -> None:
     """Write report and model where the arguments say."""
     from piezo_ident.report import write_report
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,13 +15,13 @@ from piezo_ident.cli.outputs import check_table_and_picture
 from piezo_ident.cli.records import check_order, data_of, print_faults, read_all
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, naming
-from piezo_ident.model.files import load
-from piezo_ident.model.free_run import free_run, FreeRun, FreeRunErrors, predict
-from piezo_ident.model.initial_memory import unknown_starts
+from piezo_ident.model.free_run import FreeRun, FreeRunErrors
 from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.multi_axis import EachAxis, load, voltage_of
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Record
 from piezo_ident.record.tables import blocks_of
+from piezo_ident.verbs.use import free_run, predict, prediction_doubts
 
 
 def predict_command(args: SimpleNamespace, console: Console) -> None:
@@ -37,17 +37,22 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     model = load(args.model)
     (record,) = read_all([args.record], args, console, voltage_alone=True)
     data: dict[str, Any] = {'model': str(args.model)}
+    # nothing that stands in for a reading is written as one
+    columns: dict[str, Sequence[Array]] = {}
     if record.is_measured:
         with naming(str(args.model)):
             run = free_run(model, record)
-        # without faulty samples
-        record, pieces = run.record, run.pieces
         console.say(f'{args.model} on {record.name}, free run:')
-        print_errors(run, console)
-        lost = record.n - run.errors.n
+        data |= print_run(run, console)
+        runs = {**run} if isinstance(run, EachAxis) else {'y': run}
+        lost = sum(x.record.n - x.errors.n for x in runs.values())
         if lost and args.out is not None:
             console.say(f'  {lost} readings are left out: y is nan there in {args.out}')
-        data |= error_data(run)
+        # without faulty samples
+        record = runs['y'].record if isinstance(run, FreeRun) else record
+        pieces = {axis: x.pieces for axis, x in runs.items()}
+        for axis, x in runs.items():
+            columns[axis] = [piece.measured for piece in x.record]
         if args.plot is not None:
             from piezo_ident.report import save_plot
 
@@ -59,15 +64,21 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
                 f'{record.name}: has no displacement to compare with; leave out --plot'
             )
         with naming(str(args.model)):
-            pieces = predict(model, record)
-        warnings = (*unknown_starts(model, record), *model.extrapolation(record))
+            made = predict(model, record)
+        pieces = {**made} if isinstance(made, EachAxis) else {'y': made}
+        warnings = prediction_doubts(model, record)
         console.say(f'{args.model} on {record.name}, which has no displacement: no error is known')
         for warning in warnings:
             console.say(f'  warning: {warning}')
         data['warnings'] = list(warnings)
     if args.out is not None:
         with deferred_interrupts():
-            _write_prediction(record, pieces, args.out)
+            for axis, parts in pieces.items():
+                if axis != 'y':
+                    v = voltage_of(axis)
+                    columns[v] = [piece.channels[v] for piece in record]
+                columns[f'y_hat{axis[1:]}'] = parts
+            _write_prediction(record, columns, args.out)
     print_faults(record, (), console)
     for path in filter(None, (args.out, args.plot)):
         console.say(f'wrote {path}')
@@ -75,15 +86,25 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     console.result({**data, **data_of(record), **files})
 
 
-def _write_prediction(record: Record, pieces: Sequence[Array], path: Path) -> None:
-    # nothing that stands in for a reading is written as one
-    blocks = blocks_of(record, y=[piece.measured for piece in record], y_hat=pieces)
+def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], path: Path) -> None:
+    blocks = blocks_of(record, **columns)
 
-    def columns() -> Iterator[dict[str, Array]]:
+    def known() -> Iterator[dict[str, Array]]:
         for block in blocks():
             yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
 
-    write_columns(path, columns)
+    write_columns(path, known)
+
+
+def print_run(run: FreeRun | EachAxis[FreeRun], console: Console) -> dict[str, Any]:
+    """Print the errors of a free run, of each axis where there are several, and return them."""
+    if not isinstance(run, EachAxis):
+        print_errors(run, console)
+        return error_data(run)
+    for axis, x in run.items():
+        console.say(f' axis {axis}:')
+        print_errors(x, console)
+    return {'axes': {axis: error_data(x) for axis, x in run.items()}}
 
 
 def print_errors(run: FreeRun, console: Console) -> None:

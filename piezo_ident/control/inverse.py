@@ -133,23 +133,16 @@ def invert(
     like: Inverse | None = None,
 ) -> Inverse:
     """
-    Find the voltage that moves a model along a wanted displacement.
+    Return the voltage under which a model of one axis moves as wanted; see `piezo_ident.invert`.
 
     Parameters
     ----------
-    model : StageModel
-    wanted : array_like, shape (n,)
-        Displacement [m] at the sampling rate of the model.  The stage rests before and after the
-        motion.  It has reached the first position in one stroke from its lowest voltage, and has
-        settled there.  A stage with creep should begin where nothing creeps.
     limits : tuple of float, optional
         Lowest and highest voltage [V].  Default: the identified range.
     slew : float, optional
         Largest speed of the voltage [V/s].
     clip : bool, optional
-        Come as near to the motion as the limits allow, instead of refusing it.
-    channels : mapping of str to array_like, shape (n,), optional
-        Further signals that effects of the model depend on.
+        Come as near as the limits allow, instead of refusing.
     sample_rate : float, optional
         Sampling rate of the wanted motion [Hz], to be checked against the rate of the model.
     like : Inverse, optional

@@ -90,51 +90,7 @@ def diagnose(
     *,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """
-    Find what a model lacks, add it, and say how sure that is.
-
-    Parameters
-    ----------
-    model : StageModel
-        From `identify`; it may hold effects already.
-    records : Record, or sequence of Record
-        Measured data that the model was not identified from, of its sampling rate.  Of more than
-        ``settings.most_samples`` the beginnings of the records are searched and fitted, and a
-        warning says how much that is.
-    settings : DiagnosisSettings, optional
-    progress : callable, optional
-        Called with the name of the step and the share done; may raise `Cancelled`.
-
-    Returns
-    -------
-    Diagnosis
-
-    Raises
-    ------
-    IdentificationError
-        When the records carry nothing to judge, the displacement does not follow the voltage, or
-        the joint fit is singular.
-
-    Examples
-    --------
-    A stage whose amplifier saturates, which its model does not know:
-
-    >>> from dataclasses import replace
-    >>> import numpy as np
-    >>> import piezo_ident as pi
-    >>> from piezo_ident.model.stage_model import EffectSetting
-    >>> model = pi.SimulatedStage.load('paper').model
-    >>> stage = replace(model, effects=(EffectSetting('saturation', {'high': 0.8}),))
-    >>> t = np.arange(20_000) / 20_000
-    >>> v = 2.5 * (1 + np.floor(20 * t) % 2) * (1 - np.cos(40 * np.pi * t))
-    >>> record = pi.Record.from_arrays(v, stage.simulate(v), sample_rate=20_000)
-    >>> few = pi.DiagnosisSettings(effects=('saturation', 'backlash'))
-    >>> result = pi.diagnose(model, record, few)
-    >>> result.verdict, round(result.effects[0].parameters['high'].value, 2)
-    ('named', 0.8)
-    >>> result.after.overall < 0.01 * result.before.overall
-    True
-    """
+    """Find what a model of one axis lacks; see `piezo_ident.diagnose`."""
     settings = DiagnosisSettings() if settings is None else settings
     records = records_of(records, 'diagnose, second argument')
     expect(model, StageModel, 'diagnose, first argument', 'read a model with load')

@@ -78,13 +78,10 @@ def export_c(
     feedforward: bool = True,
 ) -> str:
     """
-    Export a model as a C header: prediction and feed-forward, sample by sample.
+    Return a model of one axis as a C header; see `piezo_ident.export_c`.
 
     Parameters
     ----------
-    model : StageModel
-    name : str, optional
-        Prefix of all names in the header.
     limits : tuple of float, optional
         Lowest and highest voltage of the feed-forward [V]; by default the identified range.
     slew : float, optional
@@ -95,28 +92,6 @@ def export_c(
         First line of the header.
     feedforward : bool, optional
         Whether the header has a feed-forward.
-
-    Returns
-    -------
-    str
-        C99 without dependencies.  A comment at its head says how to call it, and which errors
-        the feed-forward leaves.
-
-    Raises
-    ------
-    DataError
-        If the model is not a `StageModel`, or limits or slew are impossible.
-    ConfigError
-        If the name is not an identifier in C.
-    ModelError
-        If an effect of the model has no C code, or the preview is shorter than the delay.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> header = pi.export_c(pi.SimulatedStage.load('paper').model, limits=(0.0, 10.0))
-    >>> 'static inline double stage_step(stage_state *s, double v)' in header
-    True
     """
     expect(model, StageModel, 'export, first argument', 'read a model with load')
     if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):

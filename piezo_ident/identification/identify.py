@@ -97,42 +97,7 @@ def identify(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
-    """
-    Identify a stage from its records.
-
-    Parameters
-    ----------
-    records : sequence of Record, or Record
-        Records with segments ``noise`` and ``triangle`` (and ``step``) are identified in three
-        steps, and segments of other kinds are left for validation.  Without them one fit covers
-        every run except its held-out samples.
-    settings : Settings, optional
-    validation : sequence of Record, or Record, optional
-        Records that are not used for fitting or choosing; the headline is their error.
-    progress : callable, optional
-        Called with the name of the step and its share done; it may raise `Cancelled`.
-    steps : Steps, optional
-        Results of steps that were taken before, from `first_steps`.  If they are given, even
-        empty, records without labelled segments are refused.
-
-    Returns
-    -------
-    Identification
-
-    Raises
-    ------
-    IdentificationError
-        If the data do not carry a model; the message says what they lack.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
-    >>> record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0)
-    >>> result = pi.identify(record, pi.Settings(thresholds=4))
-    >>> bool(result.headline.percent < 0.1)
-    True
-    """
+    """Learn a stage of one axis; see `piezo_ident.identify`."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
     expect(settings, Settings, 'identify, settings', 'give several records as a list')

@@ -126,20 +126,25 @@ def check_keys(data: Mapping[str, Any], known: Collection[str], where: str, name
     raise ModelError(f'{name}: unknown keys {listed}{where}; {cure}')
 
 
-def _check_layout(data: Mapping[str, Any], name: str) -> None:
-    """Refuse another schema, missing parts and unknown keys."""
-    if 'several_axes' in data:
-        raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
-    version = data.get('schema_version', SCHEMA_VERSION)
+def check_version(data: Mapping[str, Any], name: str, latest: int = SCHEMA_VERSION) -> None:
+    """Refuse a file of a later schema than the latest one with a ModelError."""
+    version = data.get('schema_version', latest)
     if isinstance(version, bool) or not isinstance(version, int) or version < 1:
         raise ModelError(
             f'{name}: schema_version must be a whole number, got {reprlib.repr(version)}'
         )
-    if version > SCHEMA_VERSION:
+    if version > latest:
         raise ModelError(
             f'{name}: written with model schema {reprlib.repr(version)}, this package reads up to '
-            f'{SCHEMA_VERSION}; update piezo_ident'
+            f'{latest}; update piezo_ident'
         )
+
+
+def _check_layout(data: Mapping[str, Any], name: str) -> None:
+    """Refuse another schema, missing parts and unknown keys."""
+    if 'several_axes' in data or 'axes' in data:
+        raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
+    check_version(data, name)
     missing = [key for key in _REQUIRED if key not in data]
     known = (*_REQUIRED, *_OPTIONAL)
     # a missing part may be there under a misspelt name; otherwise the file is of another kind
@@ -269,29 +274,24 @@ def model_to_dict(model: StageModel) -> dict[str, Any]:
 
 def model_to_yaml(model: StageModel) -> str:
     """Write the text of a model file."""
-    text: str = yaml.dump(
-        model_to_dict(model), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99
-    )
+    return yaml_text(model_to_dict(model))
+
+
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """Write plain data as YAML, with lists of numbers on one line."""
+    text: str = yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=99)
     return text
 
 
 def load(path: str | os.PathLike[str]) -> StageModel:
     """
-    Read a model file.
+    Read a model file of one axis.
 
     Raises
     ------
     ConfigError
         If the file cannot be read or is not YAML.
     ModelError
-        If the file is not a model, or has a later schema.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
-    >>> model = pi.load('model.yaml')
-    >>> model.sample_rate, model.hysteresis.thresholds.size
-    (20000.0, 9)
+        If the file is not a model of one axis, or has a later schema.
     """
     return model_from_dict(load_yaml(path), str(path))

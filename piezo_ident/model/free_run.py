@@ -115,37 +115,7 @@ class FreeRun(Showable):
 
 
 def free_run(model: StageModel, record: Record) -> FreeRun:
-    """
-    Predict a record in free run, and compare it with the measurement.
-
-    A record that does not start at the lowest voltage starts with an unknown memory.  The memory
-    is estimated from its early part.  A model with creep also estimates creep of earlier motion,
-    if the early part shows it.  Nothing is fitted to the samples after the early part.
-
-    Parameters
-    ----------
-    model : StageModel
-    record : Record
-        Its displacement is only used for the estimate and the errors.
-
-    Raises
-    ------
-    ModelError
-        If a piece has another sampling rate than the model, or the prediction overflows.
-    DataError
-        If the record holds no displacement; `StageModel.simulate` needs none.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> stage = pi.SimulatedStage.load('paper')
-    >>> record = stage.play(pi.Program.load('minor_loops'))
-    >>> run = pi.free_run(stage.model, record)
-    >>> run.predicted.shape == run.measured.shape
-    True
-    >>> run.errors.percent < 0.01
-    True
-    """
+    """Predict a record with a model of one axis; see `piezo_ident.free_run`."""
     expect(model, StageModel, 'free_run, first argument', 'read a model with load')
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     record.require_displacement()

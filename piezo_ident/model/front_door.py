@@ -76,7 +76,8 @@ class FrontDoor:
         """
         from piezo_ident import free_run
 
-        return free_run(self, record)
+        run: FreeRun = free_run(self, record)
+        return run
 
     def score(self: Any, record: Record) -> FreeRunErrors:
         """

@@ -21,6 +21,7 @@ from piezo_ident.diagnosis.results import (
 )
 from piezo_ident.effects import find_effect
 from piezo_ident.model import metrics
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.refined import law_told
 from piezo_ident.report.table import (
@@ -357,8 +358,10 @@ def diagnosis_page(
     )
 
 
-def diagnosis_text(result: Diagnosis) -> str:
+def diagnosis_text(result: Diagnosis | EachAxis[Diagnosis]) -> str:
     """Return verdict, errors before and after, what was added and what was not, for a terminal."""
+    if isinstance(result, EachAxis):
+        return result.told(diagnosis_text)
     alike = _alike(result)
     return plain_text(
         [

@@ -19,6 +19,7 @@ from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification, Progress, silent
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.diagnosis import diagnosis_page
 from piezo_ident.report.html import Page, page_html, Shown
@@ -45,10 +46,11 @@ PICTURES: Mapping[type, tuple[str, ...]] = {
 }
 
 Result = Identification | Diagnosis
+Results = Result | EachAxis[Identification] | EachAxis[Diagnosis]
 
 
 def write_report(
-    result: Result,
+    result: Results,
     folder: str | os.PathLike[str],
     *,
     progress: Progress = silent,
@@ -59,7 +61,7 @@ def write_report(
 
     Parameters
     ----------
-    result : Identification or Diagnosis
+    result : Identification or Diagnosis, or EachAxis of them
     folder : path
         Made when it does not exist.  The files of an earlier report there are replaced, all of
         them or none; other files stay.
@@ -73,7 +75,9 @@ def write_report(
     -------
     Path
         The page, ``report.html``; beside it the pictures, ``model.yaml`` (of a diagnosis the
-        refined model) and ``identification.json`` or ``diagnosis.json``.
+        refined model) and ``identification.json`` or ``diagnosis.json``.  Of several axes each
+        has a folder with its report, beside ``model.yaml`` of the stage; the page is that of the
+        first.
 
     Raises
     ------
@@ -90,6 +94,8 @@ def write_report(
     >>> page.name, len(list(page.parent.glob('*.png'))) > 1
     ('report.html', True)
     """
+    if isinstance(result, EachAxis):
+        return _of_axes(result, Path(folder), progress, prompt)
     expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
     kind = type(result)
     if isinstance(result, Diagnosis):
@@ -111,6 +117,21 @@ def write_report(
         with suppress(OSError):
             (target / f'{name}.png').unlink()
     return target / PAGE
+
+
+def _of_axes(
+    result: EachAxis[Identification] | EachAxis[Diagnosis],
+    folder: Path,
+    progress: Progress,
+    prompt: Prompt | None,
+) -> Path:
+    """Write the report of each axis into a folder of its own, and the model beside them."""
+    pages = []
+    for axis, x in result.items():
+        (folder / axis).mkdir(parents=True, exist_ok=True)
+        pages.append(write_report(x, folder / axis, progress=progress, prompt=prompt))
+    result.model.save(folder / MODEL)
+    return pages[0]
 
 
 def _identified(

@@ -14,6 +14,7 @@ from piezo_ident import __version__
 from piezo_ident.identification.results import ErrorRow, Identification
 from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.metrics import FORMULA, KINDS, percent
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import SineError
 from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
 from piezo_ident.report.table import (
@@ -333,8 +334,10 @@ def identification_page(
     )
 
 
-def identification_text(result: Identification) -> str:
+def identification_text(result: Identification | EachAxis[Identification]) -> str:
     """Return headline, facts, errors and warnings for a terminal."""
+    if isinstance(result, EachAxis):
+        return result.told(identification_text)
     return plain_text(
         [
             headline(result),

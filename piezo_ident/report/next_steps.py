@@ -18,6 +18,7 @@ from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.excitation.program import Program
 from piezo_ident.excitation.scaled import scaled
 from piezo_ident.identification.results import Identification
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.table import listed, number
@@ -72,19 +73,37 @@ class Step:
     command: str
 
 
-def next_steps(result: Identification | Diagnosis, prompt: Prompt) -> list[Step]:
+def next_steps(
+    result: Identification | Diagnosis | EachAxis[Identification] | EachAxis[Diagnosis],
+    prompt: Prompt,
+) -> list[Step]:
     """
     Return what to do after an identification or a diagnosis.
 
     Parameters
     ----------
-    result : Identification or Diagnosis
+    result : Identification or Diagnosis, or EachAxis of them
     prompt : Prompt
         Names of the files.
     """
+    if isinstance(result, EachAxis):
+        return [_after_axes(isinstance(next(iter(result.values())), Diagnosis), prompt)]
     if isinstance(result, Diagnosis):
         return list(_after_diagnosis(result, prompt))
     return list(_after_identification(result, prompt))
+
+
+def _after_axes(is_diagnosed: bool, prompt: Prompt) -> Step:
+    if is_diagnosed:
+        return Step(
+            'check the model on a record that took no part',
+            prompt.command('predict', prompt.model, OTHER),
+        )
+    return Step(
+        'find the paths between the axes, and what else the model lacks, on a record in which all '
+        'axes move',
+        prompt.command('diagnose', prompt.model, OTHER, '--model', 'refined.yaml'),
+    )
 
 
 def _after_identification(result: Identification, prompt: Prompt) -> Iterator[Step]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError
@@ -16,6 +16,7 @@ from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
 from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
@@ -78,7 +79,7 @@ def _longest(result: FreeRun) -> PieceRun:
     return PieceRun(record.name, record.pieces[i], result.pieces[i], result.pieces[i])
 
 
-def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
+def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> None:
     """
     Write the picture of `plot`.
 
@@ -86,7 +87,8 @@ def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
     ----------
     result : Identification, Diagnosis, FreeRun or Inverse
     path : path
-        Ending in .png, .pdf or .svg; an old file is replaced.
+        Ending in .png, .pdf or .svg; an old file is replaced.  Of several axes each has a file,
+        with its name at the end.
 
     Raises
     ------
@@ -100,6 +102,10 @@ def save_plot(result: Result, path: str | os.PathLike[str]) -> None:
         raise ConfigError(f'{path}: a picture ends in {", ".join(ENDINGS)}')
     from piezo_ident.report.figures import style
 
+    if isinstance(result, EachAxis):
+        for axis, x in result.items():
+            save_plot(x, target.with_name(f'{target.stem}_{axis}{target.suffix}'))
+        return
     drawn = plot(result)
     with temporary_output(target, overwrite=True) as file:
         drawn.savefig(file, dpi=style.DPI)

@@ -11,12 +11,15 @@ from dataclasses import replace
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.free_run import free_run, same_part_errors
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.record import Record
 from piezo_ident.report.table import number
 
 
-def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
+def validated(
+    result: Diagnosis | EachAxis[Diagnosis], records: Sequence[Record]
+) -> Diagnosis | EachAxis[Diagnosis]:
     """
     Return a diagnosis with the errors of both models on records that took no part in it.
 
@@ -25,6 +28,14 @@ def validated(result: Diagnosis, records: Sequence[Record]) -> Diagnosis:
     ModelError
         When a piece has another sampling rate than the models.
     """
+    if isinstance(result, EachAxis):
+        seen = [result.model.seen(record) for record in records]
+        return EachAxis(
+            {
+                axis: replace(x, unseen=(*x.unseen, *(_unseen(x, of[axis]) for of in seen)))
+                for axis, x in result.items()
+            }
+        )
     unseen = [_unseen(result, record) for record in records]
     return replace(result, unseen=(*result.unseen, *unseen))
 

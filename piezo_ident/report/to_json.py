@@ -20,6 +20,7 @@ from piezo_ident.identification.results import DelayResult, DynamicsResult, Iden
 from piezo_ident.model import metrics
 from piezo_ident.model.files import finite, plain
 from piezo_ident.model.free_run import FreeRun, PieceRun
+from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
@@ -28,11 +29,14 @@ from piezo_ident.report.identification import headline
 if TYPE_CHECKING:
     from piezo_ident.control.inverse import Inverse
 
+    One = Identification | Diagnosis | FreeRun | Inverse | Record
+    Shown = One | EachAxis[Identification] | EachAxis[Diagnosis] | EachAxis[FreeRun]
+
 VERSION = {'schema_version': 1, 'package_version': __version__}
 
 
 def to_json(
-    result: Identification | Diagnosis | FreeRun | Inverse | Record,
+    result: Shown,
     runs: Sequence[PieceRun] = (),
 ) -> dict[str, Any]:
     """
@@ -40,7 +44,8 @@ def to_json(
 
     Parameters
     ----------
-    result : Identification, Diagnosis, FreeRun, Inverse or Record
+    result : Identification, Diagnosis, FreeRun, Inverse or Record, or EachAxis of them
+        For several axes the key ``axes`` holds the data of each axis.
     runs : sequence of PieceRun, optional
         For the steady-state errors of sines of an identification.
 
@@ -51,6 +56,8 @@ def to_json(
         finite is None; but a parameter of an effect that is infinite becomes the text ``inf`` or
         ``-inf``, and the overall error of a model that diverged the largest number there is.
     """
+    if isinstance(result, EachAxis):
+        return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
     if isinstance(result, Diagnosis):
         data = _diagnosis(result)
     elif isinstance(result, Identification):

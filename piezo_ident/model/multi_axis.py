@@ -1,0 +1,369 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A stage of several axes: a chain for each axis, and paths between them.
+
+    y_i = chain_i(v_i) + sum over j of path_ij(m_j),        m_j = chain_j(v_j)
+
+The motion m_j is that of axis j by its own voltage, so a path carries the hysteresis, the modes
+and the creep of its source.  A path is the effect `cross_coupling` in the model of axis i; its
+channel is the motion.  An axis has the name of its displacement in a record:
+
+| axis | voltage | displacement | its motion, as a channel of the others |
+|---|---|---|---|
+| first | ``v`` | ``y`` | ``motion`` |
+| ``b`` | ``v_b`` | ``y_b`` | ``motion_b`` |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+import os
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array, interpolated
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.files import load_yaml, write_text
+from piezo_ident.model.files import (
+    check_version,
+    model_from_dict,
+    model_to_dict,
+    yaml_text,
+)
+from piezo_ident.model.free_run import free_run, predict
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.channels import role_of
+from piezo_ident.record.record import Piece, Record
+
+T = TypeVar('T')
+
+#: of a model file with several axes
+SCHEMA_VERSION = 2
+MOTION = 'motion'
+
+
+def voltage_of(axis: str) -> str:
+    """
+    Return the column of an axis's voltage.
+
+    >>> voltage_of('y'), voltage_of('y_b')
+    ('v', 'v_b')
+    """
+    return f'v{axis[1:]}'
+
+
+def motion_of(axis: str) -> str:
+    """Return the channel with the motion of an axis by its own voltage."""
+    return f'{MOTION}{axis[1:]}'
+
+
+def axes_of(records: Sequence[Record]) -> tuple[str, ...]:
+    """
+    Return the axes whose voltage and displacement records hold, the first one before the others.
+
+    Raises
+    ------
+    DataError
+        When the records do not hold the same axes.
+    """
+    of_each = {
+        record.name: (
+            'y',
+            *sorted(k for k in p.channels if role_of(k) == 'y' and voltage_of(k) in p.channels),
+        )
+        for record in records
+        for p in record
+    }
+    if len(set(of_each.values())) > 1:
+        told = '; '.join(f'{name} holds {", ".join(axes)}' for name, axes in of_each.items())
+        raise DataError(f'{told}; give records of the same axes')
+    return next(iter(of_each.values()), ('y',))
+
+
+def axis_record(
+    record: Record, axis: str, motions: Mapping[str, Sequence[Array]] | None = None
+) -> Record:
+    """
+    Return a record as one axis sees it.
+
+    Parameters
+    ----------
+    record : Record
+    axis : str
+        Its voltage and displacement become v and y.  A segment in which it rests loses its label.
+    motions : mapping of str to sequence of ndarray, optional
+        Of the other axes, an array a piece [m].  They become channels.
+    """
+    span = max(float(np.ptp(_columns(p)[voltage_of(axis)])) for p in record)
+
+    def seen(piece: Piece, moved: Mapping[str, Array]) -> Piece:
+        columns = _columns(piece)
+        v, sound = columns[voltage_of(axis)], piece.sound
+        y = columns.get(axis, np.full(piece.n, np.nan))
+        if axis != 'y':
+            known = np.isfinite(y)
+            sound = None if known.all() or not known.any() else known
+            y = y if sound is None else interpolated(y, ~known)
+        kept = (s for s in piece.segments if np.ptp(v[s.start : s.stop]) > 1e-3 * span)
+        before = piece.before and seen(
+            piece.before, {k: np.full(piece.before.n, m[0]) for k, m in moved.items()}
+        )
+        others = {k: x for k, x in piece.channels.items() if not role_of(k)}
+        return replace(
+            piece,
+            v=v,
+            y=y,
+            sound=sound,
+            segments=tuple(kept),
+            before=before,
+            channels={**others, **{motion_of(k): m for k, m in moved.items()}},
+        )
+
+    pieces = tuple(
+        seen(piece, {k: m[i] for k, m in (motions or {}).items() if k != axis})
+        for i, piece in enumerate(record)
+    )
+    return Record(pieces, record.name, record.faults)
+
+
+def _columns(piece: Piece) -> dict[str, Array]:
+    return {**piece.channels, 'v': piece.v, 'y': piece.y}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EachAxis(Mapping[str, T], Generic[T]):
+    """
+    What a verb gives for each axis of a stage, by the name of its displacement.
+
+    Examples
+    --------
+    >>> from piezo_ident.model.multi_axis import EachAxis
+    >>> errors = EachAxis({'y': 0.2, 'y_b': 0.3})
+    >>> errors['y_b'], list(errors)
+    (0.3, ['y', 'y_b'])
+    """
+
+    axes: Mapping[str, T]
+
+    def __getitem__(self, axis: str) -> T:
+        """Return what belongs to an axis."""
+        return self.axes[axis]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the axes."""
+        return iter(self.axes)
+
+    def __len__(self) -> int:
+        """Return the number of axes."""
+        return len(self.axes)
+
+    def __repr__(self) -> str:
+        """Return what is told of each axis, under its name."""
+        return self.told(repr)
+
+    def mapped(self, change: Callable[[str, T], T]) -> EachAxis[T]:
+        """Return what a function makes of each axis's name and what belongs to it."""
+        return EachAxis({axis: change(axis, x) for axis, x in self.items()})
+
+    def told(self, text: Callable[[T], str]) -> str:
+        """Return a text of each axis, under its name."""
+        return '\n\n'.join(f'-- axis {axis}\n{text(x)}' for axis, x in self.items())
+
+    @property
+    def model(self) -> MultiAxisModel:
+        """The model of the stage, of results that hold one for each axis."""
+        return MultiAxisModel({axis: x.model for axis, x in self.items()})  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True, eq=False)
+class MultiAxisModel:
+    """
+    A stage of several axes: a model for each, with the paths between them among its effects.
+
+    Parameters
+    ----------
+    axes : mapping of str to StageModel
+        By the name of the displacement: ``y``, ``y_b``.
+
+    Raises
+    ------
+    ModelError
+        When the axes have different sampling rates, or a path has no source.
+
+    Examples
+    --------
+    Two axes of a scanner; the second moves by 1 % of what the first does:
+
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> from dataclasses import replace
+    >>> from piezo_ident.model.stage_model import EffectSetting
+    >>> one = pi.SimulatedStage.load('paper').model
+    >>> shape = {'channel': 'motion', 'gain': 0.01 / one.scaling.Y, 'frequency': 1000.0}
+    >>> other = replace(one, effects=(EffectSetting('cross_coupling', shape),))
+    >>> stage = pi.MultiAxisModel({'y': one, 'y_b': other})
+    >>> y = stage.simulate({'v': np.linspace(0, 10, 5000), 'v_b': np.zeros(5000)})
+    >>> round(100 * float(y['y_b'][-1] / y['y'][-1]), 2)
+    1.0
+    >>> stage.save('stage.yaml')
+    >>> list(pi.load('stage.yaml').axes)
+    ['y', 'y_b']
+    """
+
+    axes: Mapping[str, StageModel]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'axes', MappingProxyType(dict(self.axes)))
+        if not self.axes:
+            raise ModelError('model: has no axis; see docs/two_axes.md')
+        if len({model.sample_rate for model in self.axes.values()}) != 1:
+            raise ModelError('model: the axes differ in sample_rate; give axes of one rate')
+        for axis, model in self.axes.items():
+            others = [motion_of(k) for k in self.axes if k != axis]
+            for effect in model.effects:
+                if effect.channel.startswith(MOTION) and effect.channel not in others:
+                    raise ModelError(
+                        f'model: {effect.name} of axis {axis} needs {effect.channel}, and the '
+                        f'other axes give {", ".join(others) or "none"}'
+                    )
+
+    def __repr__(self) -> str:
+        lines = (f'  {axis}: {model!r}' for axis, model in self.axes.items())
+        return '\n'.join(['MultiAxisModel:', *lines])
+
+    @property
+    def sample_rate(self) -> float:
+        """Rate of all axes [Hz]."""
+        return next(iter(self.axes.values())).sample_rate
+
+    def own(self, axis: str) -> StageModel:
+        """Return the model of an axis without the paths of the others."""
+        model = self.axes[axis]
+        kept = tuple(e for e in model.effects if not e.channel.startswith(MOTION))
+        return replace(model, effects=kept)
+
+    def takes(self, piece: Piece) -> bool:
+        """Return whether the model holds at the sampling rate of a piece."""
+        return all(model.takes(piece) for model in self.axes.values())
+
+    def check_rate(self, piece: Piece) -> None:
+        """Refuse a piece with another sampling rate than the model with a ModelError."""
+        next(iter(self.axes.values())).check_rate(piece)
+
+    def check_axes(self, axes: Sequence[str], name: str) -> None:
+        """Refuse data of other axes with a DataError."""
+        missing = [axis for axis in self.axes if axis not in axes]
+        if missing:
+            raise DataError(
+                f'{name}: has nothing of {", ".join(missing)}; the model holds for '
+                f'{", ".join(self.axes)}'
+            )
+
+    def motions(self, record: Record) -> dict[str, list[Array]]:
+        """Return the motion of each axis by its own voltage, an array a piece [m]."""
+        found = {}
+        for axis in self.axes:
+            seen, own = axis_record(record, axis), self.own(axis)
+            known = all(np.isfinite(piece.y).all() for piece in seen)
+            found[axis] = [*(free_run(own, seen).pieces if known else predict(own, seen))]
+        return found
+
+    def seen(self, record: Record) -> dict[str, Record]:
+        """Return a record as each axis sees it, with the motions of the others as channels."""
+        columns = {c for piece in record for c in _columns(piece)}
+        self.check_axes(
+            [f'y{c[1:]}' for c in columns if c == 'v' or role_of(c) == 'v'], record.name
+        )
+        motions = self.motions(record)
+        return {axis: axis_record(record, axis, motions) for axis in self.axes}
+
+    def simulate(
+        self, voltages: Mapping[str, ArrayLike], *, channels: Mapping[str, ArrayLike] | None = None
+    ) -> dict[str, Array]:
+        """
+        Return the displacement of each axis that voltages cause, in free run.
+
+        Parameters
+        ----------
+        voltages : mapping of str to array_like, shape (n,)
+            By their columns, ``v`` and ``v_b`` [V].
+        channels : mapping of str to array_like, shape (n,), optional
+            Further signals that effects depend on.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n,)
+            [m]
+
+        Raises
+        ------
+        DataError
+            When the voltage of an axis is missing.
+        """
+        self.check_axes([f'y{name[1:]}' for name in voltages], 'simulate')
+        v, further = {a: voltages[voltage_of(a)] for a in self.axes}, dict(channels or {})
+        own = {a: self.own(a).simulate(v[a], channels=further) for a in self.axes}
+        moved = {motion_of(a): m for a, m in own.items()}
+        return {
+            axis: own[axis]
+            if model.effects == self.own(axis).effects
+            else model.simulate(v[axis], channels={**further, **moved})
+            for axis, model in self.axes.items()
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model file, in one piece: an old file stays whole until the new one is."""
+        write_text(path, multi_axis_yaml(self))
+
+
+def multi_axis_yaml(model: MultiAxisModel) -> str:
+    """Return the text of a model file of several axes."""
+    of_axes = {axis: model_to_dict(x) for axis, x in model.axes.items()}
+    return yaml_text({'schema_version': SCHEMA_VERSION, 'axes': of_axes})
+
+
+def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
+    """Build a model of several axes from the contents of its file; ModelError when it is none."""
+    check_version(data, name, SCHEMA_VERSION)
+    axes = data['axes']
+    if not (
+        isinstance(axes, Mapping) and axes and all(isinstance(x, Mapping) for x in axes.values())
+    ):
+        raise ModelError(f'{name}: axes must name a model for each axis; see docs/two_axes.md')
+    wrong = [str(k) for k in axes if k != 'y' and role_of(str(k)) != 'y']
+    if wrong:
+        raise ModelError(f'{name}: axes {", ".join(wrong)}: an axis is y, or y_ and its name')
+    try:
+        return MultiAxisModel(
+            {str(k): model_from_dict(x, f'{name}: axes.{k}') for k, x in axes.items()}
+        )
+    except ModelError as error:
+        raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
+
+
+def load(path: str | os.PathLike[str]) -> StageModel | MultiAxisModel:
+    """
+    Read a model file, of one axis or of several.
+
+    Raises
+    ------
+    ConfigError
+        When the file cannot be read or is not YAML.
+    ModelError
+        When it is not a model, or one of a later schema.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
+    >>> model = pi.load('model.yaml')
+    >>> model.sample_rate, model.hysteresis.thresholds.size
+    (20000.0, 9)
+    """
+    data = load_yaml(path)
+    return (multi_axis_from_dict if 'axes' in data else model_from_dict)(data, str(path))

@@ -1,0 +1,102 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A model of one axis or of several as a C header."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from piezo_ident.export.header import export_c as export_axis
+from piezo_ident.export.header import plain_text
+from piezo_ident.export.links import LinkGroup, links_of
+from piezo_ident.model.multi_axis import MOTION, motion_of, MultiAxisModel, voltage_of
+from piezo_ident.model.stage_model import StageModel
+
+
+def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options: Any) -> str:
+    """
+    Return a model as a C header: prediction and feed-forward, sample by sample.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    name : str, optional
+        With which all names in the header begin.
+    **options
+        ``limits``, ``slew``, ``preview``, ``title`` and ``feedforward`` of
+        `piezo_ident.export.header.export_c`.
+
+    Returns
+    -------
+    str
+        C99 without dependencies; a comment at its head says how to call it, and what the
+        feed-forward does not make up for.  Of several axes the header of each comes first; the
+        step of the stage takes all voltages.
+
+    Raises
+    ------
+    DataError
+        When it is given no model, or limits or slew are impossible.
+    ConfigError
+        When the name is none in C.
+    ModelError
+        When an effect of the model is not written in C, or the preview is shorter than its delay.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> header = pi.export_c(pi.SimulatedStage.load('paper').model, limits=(0.0, 10.0))
+    >>> 'static inline double stage_step(stage_state *s, double v)' in header
+    True
+    """
+    if not isinstance(model, MultiAxisModel):
+        return export_axis(model, name, **options)
+    tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
+    sources = [a for a in model.axes if any(motion_of(a) in paths(x) for x in model.axes.values())]
+    texts = [
+        export_axis(model.own(axis), f'{tags[axis]}_own', feedforward=False) for axis in sources
+    ]
+    texts += [export_axis(x, tags[axis], **options) for axis, x in model.axes.items()]
+    return '\n'.join([*texts, _stage(model, name, tags, sources)])
+
+
+def paths(model: StageModel) -> list[str]:
+    """Return the motions of other axes among the channels of a model, in the order of its C."""
+    links = [link for part in links_of(model) for link in part.links]
+    return LinkGroup(links).channels
+
+
+def _stage(model: MultiAxisModel, name: str, tags: dict[str, str], sources: list[str]) -> str:
+    """Return the stage of all axes in C, behind the headers of each."""
+    order, n = list(model.axes), len(model.axes)
+    members = [f'    {tags[a]}_own_state own_{a};' for a in sources]
+    members += [f'    {tags[a]}_state {a};' for a in order]
+    rest = [f'    {tags[a]}_own_reset(&s->own_{a}, v[{order.index(a)}]);' for a in sources]
+    rest += [f'    y[{i}] = {tags[a]}_reset(&s->{a}, v[{i}]);' for i, a in enumerate(order)]
+    step, further = [], []
+    for a in sources:
+        i = order.index(a)
+        step.append(f'    const double own_{a} = {tags[a]}_own_step(&s->own_{a}, v[{i}]);')
+    for i, (axis, x) in enumerate(model.axes.items()):
+        for k, channel in enumerate(paths(x)):
+            if channel.startswith(MOTION):
+                step.append(f'    s->{axis}.channel[{k}] = own_y{channel[len(MOTION) :]};')
+            else:
+                further.append(f' *     s.{axis}.channel[{k}]  {plain_text(channel)}')
+        step.append(f'    y[{i}] = {tags[axis]}_step(&s->{axis}, v[{i}]);')
+    call = f'{name}_state *s, const double v[{n}], double y[{n}]'
+    return '\n'.join(
+        [
+            f'/* The stage of {n} axes: v is {", ".join(map(voltage_of, order))}, '
+            f'y is {", ".join(order)}. */',
+            *(['/* Before each step the caller sets', *further, ' */'] if further else []),
+            f'#ifndef {name.upper()}_OF_AXES\n#define {name.upper()}_OF_AXES\n',
+            f'typedef struct {{\n{chr(10).join(members)}\n}} {name}_state;\n',
+            f'static inline void {name}_reset({call})\n{{',
+            *rest,
+            f'}}\n\nstatic inline void {name}_step({call})\n{{',
+            *step,
+            '}\n\n#endif\n',
+        ]
+    )

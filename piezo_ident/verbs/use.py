@@ -1,0 +1,265 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Predict and invert with a model of one axis or of several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError
+from piezo_ident.control.inverse import Inverse
+from piezo_ident.control.inverse import invert as invert_axis
+from piezo_ident.model.free_run import free_run as run_axis
+from piezo_ident.model.free_run import FreeRun
+from piezo_ident.model.free_run import predict as predict_axis
+from piezo_ident.model.initial_memory import unknown_starts
+from piezo_ident.model.metrics import percent_of_stroke
+from piezo_ident.model.multi_axis import (
+    axis_record,
+    EachAxis,
+    motion_of,
+    MultiAxisModel,
+    voltage_of,
+)
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+
+#: rounds of an inversion of several axes, at most, and the change of a voltage [of the span of
+#: the model] from one to the next that ends them
+ROUNDS, SAME = 6, 1e-5
+
+
+@overload
+def free_run(model: StageModel, record: Record) -> FreeRun: ...
+
+
+@overload
+def free_run(
+    model: StageModel | MultiAxisModel, record: Record
+) -> FreeRun | EachAxis[FreeRun]: ...
+
+
+def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | EachAxis[FreeRun]:
+    """
+    Predict a record in free run, and compare it with what was measured.
+
+    A record that does not start at the lowest voltage starts from an unknown memory, which is
+    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
+    shows.  Nothing is fitted to the samples after that part.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    record : Record
+        Its displacement serves only the estimate and the errors.
+
+    Returns
+    -------
+    FreeRun, or EachAxis of FreeRun
+
+    Raises
+    ------
+    ModelError
+        When a piece has another sampling rate than the model, or the prediction overflows.
+    DataError
+        When the record holds no displacement, which `simulate` of the model does not need; or
+        lacks an axis.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('minor_loops'))
+    >>> run = pi.free_run(stage.model, record)
+    >>> run.predicted.shape == run.measured.shape
+    True
+    >>> run.errors.percent < 0.01
+    True
+    """
+    if not isinstance(model, MultiAxisModel):
+        return run_axis(model, record)
+    seen = model.seen(record)
+    return EachAxis({axis: run_axis(x, seen[axis]) for axis, x in model.axes.items()})
+
+
+def predict(
+    model: StageModel | MultiAxisModel, record: Record
+) -> tuple[Array, ...] | EachAxis[tuple[Array, ...]]:
+    """Return the displacement that voltages cause, whatever was measured, an array a piece [m]."""
+    if not isinstance(model, MultiAxisModel):
+        return predict_axis(model, record)
+    seen = model.seen(record)
+    return EachAxis({axis: predict_axis(x, seen[axis]) for axis, x in model.axes.items()})
+
+
+def prediction_doubts(model: StageModel | MultiAxisModel, record: Record) -> tuple[str, ...]:
+    """Return what limits the trust in a prediction from voltages alone."""
+    if not isinstance(model, MultiAxisModel):
+        return (*unknown_starts(model, record), *model.extrapolation(record))
+    return tuple(
+        f'axis {axis}: {text}'
+        for axis, x in model.axes.items()
+        for text in prediction_doubts(x, axis_record(record, axis))
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MultiAxisInverse(EachAxis[Inverse]):
+    """
+    The voltages under which a stage of several axes moves as wanted.
+
+    Attributes
+    ----------
+    axes : mapping of str to Inverse
+        Of each axis, with the motions of the others known.
+    voltages : dict of str to ndarray, shape (n,)
+        By their columns, ``v`` and ``v_b``, from one common beginning [V].
+    predicted : dict of str to ndarray, shape (n,)
+        Displacement of the whole model under them, by axis [m].
+    lead : int
+        Samples by which the voltages begin before the wanted motion.
+    errors : dict of str to float
+        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> one = pi.SimulatedStage.load('paper').model
+    >>> stage = pi.MultiAxisModel({'y': one, 'y_b': one})
+    >>> drive = pi.invert(stage, {'y': np.linspace(20e-6, 30e-6, 500)})
+    >>> sorted(drive.voltages), drive.errors['y'] < 0.1
+    (['v', 'v_b'], True)
+    """
+
+    voltages: Mapping[str, Array]
+    predicted: Mapping[str, Array]
+    lead: int
+    errors: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        """Return what is told of each axis, and what is left of all together."""
+        left = ', '.join(f'{axis} {error:.2g}' for axis, error in self.errors.items())
+        return f'{super().__repr__()}\n\nleft by the inversion of all [% of stroke]: {left}'
+
+
+@overload
+def invert(model: StageModel, wanted: ArrayLike, **options: Any) -> Inverse: ...
+
+
+@overload
+def invert(
+    model: MultiAxisModel, wanted: Mapping[str, ArrayLike], **options: Any
+) -> MultiAxisInverse: ...
+
+
+def invert(
+    model: StageModel | MultiAxisModel,
+    wanted: ArrayLike | Mapping[str, ArrayLike],
+    *,
+    channels: Mapping[str, ArrayLike] | None = None,
+    **options: Any,
+) -> Inverse | MultiAxisInverse:
+    """
+    Return the voltage under which a model moves as wanted, or the voltages of all its axes.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    wanted : array_like, shape (n,), or mapping of str to array_like
+        Displacement [m], sampled at the rate of the model; of several axes each by its name, and
+        one that is absent rests at the displacement of its lowest voltage.  Before and after it
+        the stage rests, at its beginning as one that came there from its lowest voltage in one
+        stroke and has settled: with creep, better begin where nothing creeps.
+    channels : mapping of str to array_like, shape (n,), optional
+        Further signals that effects of the model depend on.
+    **options
+        ``limits``, ``slew``, ``clip``, ``sample_rate`` and ``like`` of
+        `piezo_ident.control.inverse.invert`; those of several axes hold for each.
+
+    Returns
+    -------
+    Inverse or MultiAxisInverse
+
+    Raises
+    ------
+    DataError
+        When the wanted motion is no vector of finite numbers, or the limits do not reach it.
+    ModelError
+        When the model has no inverse.
+
+    Notes
+    -----
+    The motion of the other axes is a known disturbance of each.  It is the wanted one at first,
+    and then that under the voltages of the round before.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import piezo_ident as pi
+    >>> model = pi.SimulatedStage.load('paper').model
+    >>> t = np.arange(4000) / model.sample_rate
+    >>> wanted = 30e-6 * (1 - np.cos(2 * np.pi * 10 * t)) + 5e-6
+    >>> drive = pi.invert(model, wanted)
+    >>> drive.error < 0.01, bool(0 <= drive.v.min() and drive.v.max() <= 10)
+    (True, True)
+    """
+    if not isinstance(model, MultiAxisModel):
+        if isinstance(wanted, Mapping):
+            raise DataError('invert: the model has one axis; give one motion')
+        return invert_axis(model, wanted, channels=channels, **options)
+    goals = _goals(model, wanted)
+    moved, found = dict(goals), dict[str, Inverse]()
+    for _ in range(ROUNDS):
+        last, found = found, {}
+        for axis, x in model.axes.items():
+            others = {motion_of(k): m for k, m in moved.items() if k != axis}
+            beside = {**(channels or {}), **others}
+            found[axis] = invert_axis(x, goals[axis], channels=beside, **options)
+        for axis, one in found.items():
+            y = model.own(axis).simulate(one.v, channels=_led(channels, one.lead))
+            moved[axis] = y[one.lead :]
+        if last and all(_alike(last[k], found[k], model.axes[k].scaling.V) for k in found):
+            break
+    lead = max(one.lead for one in found.values())
+    v = {
+        voltage_of(k): np.pad(one.v, (lead - one.lead, 0), mode='edge') for k, one in found.items()
+    }
+    predicted = model.simulate(v, channels=_led(channels, lead))
+    errors = {k: percent_of_stroke(goals[k], y[lead:]) for k, y in predicted.items()}
+    return MultiAxisInverse(found, v, predicted, lead, errors)
+
+
+def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Array]:
+    """Return the wanted motion of every axis, or refuse it."""
+    if not isinstance(wanted, Mapping):
+        raise DataError(
+            f'invert: give the motion of each axis by its name, of {", ".join(model.axes)}'
+        )
+    unknown = [name for name in wanted if name not in model.axes]
+    if unknown or not wanted:
+        raise DataError(
+            f'invert: {", ".join(unknown) or "no motion"}: the axes are {", ".join(model.axes)}'
+        )
+    goals = {name: np.asarray(y, dtype=np.float64) for name, y in wanted.items()}
+    sizes = {y.size for y in goals.values()}
+    if len(sizes) > 1:
+        raise DataError('invert: the motions of the axes differ in length; give one a sample')
+    rest = {a: model.own(a).simulate([x.scaling.range[0]])[0] for a, x in model.axes.items()}
+    return {a: goals.get(a, np.full(max(sizes), rest[a])) for a in model.axes}
+
+
+def _led(channels: Mapping[str, ArrayLike] | None, lead: int) -> dict[str, Array]:
+    """Return channels that begin so many samples earlier with their first values."""
+    return {k: np.pad(np.asarray(x), (lead, 0), mode='edge') for k, x in (channels or {}).items()}
+
+
+def _alike(last: Inverse, one: Inverse, span: float) -> bool:
+    a, b = (x.v[x.lead :] for x in (last, one))
+    return bool(np.abs(a - b).max() < SAME * abs(span))

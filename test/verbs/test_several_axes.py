@@ -1,0 +1,175 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A stage of several axes: identified, diagnosed, predicted, inverted, saved and exported."""
+
+from dataclasses import replace
+import subprocess
+
+from axes_scanner import chain, CROSS, path, play, raster, scanner, sweeps
+from c_compiler import COMPILER, needs_compiler, STRICT
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.model.multi_axis import axis_record, MultiAxisModel
+import pytest
+
+#: plays voltages from its input through a header, a line a sample
+MAIN = """
+#include <stdio.h>
+#include "stage.h"
+
+int main(void)
+{
+    stage_state s;
+    double v[2] = {0.0, 0.0}, y[2];
+    stage_reset(&s, v, y);
+    while (scanf("%lf %lf", &v[0], &v[1]) == 2) {
+        stage_step(&s, v, y);
+        printf("%.17g %.17g\\n", y[0], y[1]);
+    }
+    return 0;
+}
+"""
+#: saves the choice of a number
+FEW = pi.Settings(thresholds=8)
+ONLY_PATHS = pi.DiagnosisSettings(effects=('cross_coupling', 'backlash'))
+
+
+@pytest.fixture(scope='module')
+def one_by_one():
+    rng = np.random.default_rng(0)
+    first, second, rest = sweeps(6000, rng), sweeps(6000, rng), np.zeros(6000)
+    v, v_b = np.concatenate([first, rest]), np.concatenate([rest, second])
+    return pi.identify(play(v, v_b, name='one by one'), FEW)
+
+
+@pytest.fixture(scope='module')
+def diagnosed(one_by_one):
+    rng = np.random.default_rng(1)
+    both = play(sweeps(6000, rng), sweeps(6000, rng), seed=1, name='both')
+    return pi.diagnose(one_by_one.model, both, ONLY_PATHS)
+
+
+def test_axes_that_move_one_after_the_other_are_identified_each_alone(one_by_one):
+    assert list(one_by_one) == ['y', 'y_b']
+    for axis, result in one_by_one.items():
+        assert result.headline.percent < 0.05
+        assert result.model.scaling.Y == pytest.approx(scanner().axes[axis].scaling.Y, rel=0.1)
+
+
+def test_a_raster_is_predicted_with_the_paths_that_are_found(diagnosed, one_by_one):
+    record = play(*raster(6000), seed=2)
+    before, after = (pi.free_run(m, record) for m in (one_by_one.model, diagnosed.model))
+    for axis in ('y', 'y_b'):
+        assert before[axis].errors.percent > 0.3
+        assert after[axis].errors.percent < 0.1
+
+
+def test_each_path_is_named_with_its_source_and_has_its_size(diagnosed):
+    for axis, source, share in (('y', 'motion_b', CROSS[1]), ('y_b', 'motion', CROSS[0])):
+        (effect,) = diagnosed[axis].effects
+        assert effect.name == 'cross_coupling'
+        assert effect.parameters['channel'].value == source
+        gain = effect.parameters['gain'].value * diagnosed[axis].model.scaling.Y
+        assert gain == pytest.approx(share, rel=0.02)
+
+
+def test_axes_of_a_raster_are_identified():
+    result = pi.identify(play(*raster(2500)), FEW)
+    for axis in ('y', 'y_b'):
+        # what the other axis does is no part of either chain
+        assert result[axis].headline.percent < 1.5
+
+
+def test_all_axes_are_inverted_together():
+    stage, t = scanner(), np.arange(3000) / 1000.0
+    wanted = {
+        'y': 25e-6 * (1 - 0.8 * np.cos(2 * np.pi * 2 * t)),
+        'y_b': 15e-6 * (1 - 0.8 * np.cos(2 * np.pi * 0.5 * t)),
+    }
+    drive = pi.invert(stage, wanted)
+    assert set(drive.voltages) == {'v', 'v_b'}
+    y = stage.simulate(drive.voltages)
+    for axis, goal in wanted.items():
+        assert np.abs(y[axis][drive.lead :] - goal).max() < 1e-4 * np.ptp(goal)
+        assert drive.errors[axis] < 0.005
+    # each alone, as if the other did not move, misses by its path
+    alone = {axis: pi.invert(stage.own(axis), y) for axis, y in wanted.items()}
+    y = stage.simulate({f'v{axis[1:]}': x.v[x.lead :] for axis, x in alone.items()})
+    assert np.ptp(y['y'] - wanted['y']) > 4e-3 * np.ptp(wanted['y'])
+
+
+def test_an_axis_that_is_not_named_stays_at_rest():
+    drive = pi.invert(scanner(), {'y_b': np.full(500, 10e-6)})
+    assert np.ptp(drive.predicted['y']) < 0.01e-6
+
+
+@pytest.mark.parametrize(
+    ('wanted', 'names'),
+    [
+        (np.zeros(10), 'y, y_b'),
+        ({'z': np.zeros(10)}, 'z'),
+        ({}, 'y, y_b'),
+        ({'y': np.zeros(10), 'y_b': np.zeros(9)}, 'length'),
+    ],
+)
+def test_motions_that_do_not_fit_the_axes_are_refused(wanted, names):
+    with pytest.raises(pi.DataError, match=names):
+        pi.invert(scanner(), wanted)
+
+
+def test_one_file_holds_all_axes(tmp_path):
+    stage, v = scanner(), dict(zip(('v', 'v_b'), raster(500), strict=True))
+    stage.save(tmp_path / 'stage.yaml')
+    read = pi.load(tmp_path / 'stage.yaml')
+    assert isinstance(read, MultiAxisModel)
+    for axis, y in stage.simulate(v).items():
+        np.testing.assert_array_equal(read.simulate(v)[axis], y)
+
+
+@pytest.mark.parametrize(
+    ('text', 'names'),
+    [
+        ('schema_version: 3\naxes: {}\n', 'schema 3'),
+        ('axes: {}\n', 'each axis'),
+        ('axes: 3\n', 'axes'),
+        ('axes: {z: {}}\n', 'z'),
+        ('axes: {y: {sample_rate: 3}}\n', 'axes.y'),
+    ],
+)
+def test_a_file_that_is_no_model_of_axes_is_refused_by_its_name(tmp_path, text, names):
+    (tmp_path / 'wrong.yaml').write_text(text)
+    with pytest.raises(pi.ModelError, match=f'wrong.yaml.*{names}'):
+        pi.load(tmp_path / 'wrong.yaml')
+
+
+def test_axes_that_do_not_belong_together_are_refused():
+    one = chain([0.1, 0.1, 0.1], 0.5, 50e-6)
+    with pytest.raises(pi.ModelError, match='sample_rate'):
+        MultiAxisModel({'y': one, 'y_b': replace(one, sample_rate=2000.0)})
+    with pytest.raises(pi.ModelError, match='motion_c'):
+        MultiAxisModel({'y': path(one, 'motion_c', 0.01), 'y_b': one})
+    with pytest.raises(pi.DataError, match='y_b'):
+        pi.free_run(scanner(), pi.Record.from_arrays(*np.zeros((2, 100)), sample_rate=1000.0))
+
+
+def test_an_axis_sees_no_label_under_which_it_rests():
+    moves, rests = np.linspace(0, 10, 100), np.zeros(100)
+    v, v_b = np.concatenate([moves, rests]), np.concatenate([rests, moves])
+    record = play(v, v_b, segments=(['triangle:1', 'triangle:2'], [0, 100]))
+    labels = [axis_record(record, axis).labels for axis in ('y', 'y_b')]
+    assert labels == [('triangle:1',), ('triangle:2',)]
+
+
+@needs_compiler
+def test_the_header_in_c_does_what_the_model_does(tmp_path):
+    stage, v = scanner(), [x - x[0] for x in raster(400)]
+    (tmp_path / 'stage.h').write_text(pi.export_c(stage))
+    (tmp_path / 'main.c').write_text(MAIN)
+    command = [COMPILER, *STRICT, 'main.c', '-o', 'main', '-lm']
+    subprocess.run(command, cwd=tmp_path, check=True)
+    given = '\n'.join(f'{a!r} {b!r}' for a, b in np.transpose(v).tolist())
+    done = subprocess.run([tmp_path / 'main'], input=given, capture_output=True, text=True)
+    made = np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
+    y = stage.simulate({'v': v[0], 'v_b': v[1]})
+    np.testing.assert_allclose(made, np.column_stack([y['y'], y['y_b']]), atol=1e-15)
