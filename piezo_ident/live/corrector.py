@@ -21,6 +21,7 @@ from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
 from piezo_ident.record.blocks import Samples
 
 #: what an observer tells of its corrections, and of which of its numbers
@@ -45,6 +46,11 @@ FAINT = 1e-4
 SURE = 3.0
 #: time of the stream for which displacement is waited for [s]
 PATIENCE = 0.5
+#: time constant by which a wanted motion takes over what is found: a step would excite the modes
+#: of a stage [s] (taste)
+FADE = 0.01
+#: what it takes over at most, as a share of the span: a sensor may be at fault (taste)
+MOST = 0.1
 
 
 def gain_change(value: float, std: float) -> str:
@@ -133,6 +139,17 @@ class Corrector:
         self.told = {}
         self._forget()
 
+    def ahead(self, lead: int, n: int) -> tuple[Array, float]:
+        """
+        Return what offset and creep [m] will be, shape (n,), and the relative change of the gain.
+
+        The first of the samples comes `lead` samples behind the last voltage.
+        """
+        if self._observer is None:
+            return np.zeros(n), 0.0
+        waiting = sum(block.v.size for block in self._waiting)
+        return self._observer.ahead(lead + waiting, n)
+
     def accept(self) -> str:
         """Take the present step of the sensor as its zero; return what was accepted."""
         if self._observer is None:
@@ -202,7 +219,7 @@ class Corrector:
 
     def measured(self, t: Array, y: Array) -> list[Estimated]:
         """Take displacement [m] of times that were predicted; return what can be estimated."""
-        if self._observer is None:
+        if self._observer is None or np.isnan(self._clock.period):
             return []
         ticks = np.rint((t - self._clock.begin) / self._clock.period).astype(np.int64)
         self._measured.append((ticks, y))
@@ -246,3 +263,80 @@ class Corrector:
         rows = [{n: float(getattr(seen, x)[k]) for n, x in names.items()} for k in first]
         self._bin, self.told = int(bins[-1]), rows[-1] if rows else self.told
         return rows
+
+
+class Follower:
+    """
+    Moves a wanted motion by what the stage is off, so that the stage goes where it is wanted.
+
+    What a model makes of the corrected motion is that motion; the stage adds offset, creep and
+    gain to it.
+
+    Parameters
+    ----------
+    model : StageModel
+    gain : bool
+        Whether the gain is followed, too.
+    step : float
+        Largest change of the correction from one sample to the next [m].
+    stream : Stream, optional
+        A run of the model up to now; at rest when absent.
+    known : bool, optional
+        Whether that run has the memory of the plays.
+
+    Attributes
+    ----------
+    corrector : Corrector
+    is_limited : bool
+        Whether the last correction was as large as it may be.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        gain: bool,
+        step: float,
+        stream: Stream | None = None,
+        known: bool = False,
+    ) -> None:
+        self.corrector, self._model, self._step = Corrector(gain=gain), model, step
+        self.corrector.set_model(model)
+        self._stream, self._known = stream or model.stream(), known
+        self._newest = -np.inf
+        # what is applied of what the stage adds [m], and of its gain
+        self._offset = self._gain = 0.0
+        self.is_limited = False
+
+    def drove(self, t: Array, v: Array) -> None:
+        """Take the voltage [V] that left, with its time [s]; at least one sample."""
+        self._newest = float(t[-1])
+        prediction = Samples(t, self._stream.process(v, t))
+        self.corrector.predicted(prediction, Samples(t, v), self._known)
+
+    def measured(self, samples: Samples) -> None:
+        """Take a block of displacement; what is no number, or ahead of the voltage, is none."""
+        usable = np.isfinite(samples.values) & (samples.t <= self._newest)
+        if usable.any():
+            self.corrector.measured(samples.t[usable], samples.values[usable])
+
+    def process(self, wanted: Array, lead: int) -> Array:
+        """
+        Return the next samples of a wanted motion [m], corrected; shapes (n,).
+
+        The first of them is wanted `lead` samples behind the last voltage.
+        """
+        n, s = wanted.size, self._model.scaling
+        offset, gain = self.corrector.ahead(lead + n - 1, 1)
+        share = 1.0 - np.exp(-n / (FADE * self._model.sample_rate))
+        most = n * self._step
+        way = float(np.clip(share * (offset[0] - self._offset), -most, most))
+        most /= abs(s.Y)
+        turn = float(np.clip(share * (np.clip(gain, -MOST, MOST) - self._gain), -most, most))
+        part = np.arange(1, n + 1) / n
+        add = self._offset + way * part
+        gains = self._gain + turn * part
+        self._offset, self._gain = self._offset + way, self._gain + turn
+        change = (wanted - s.y0 - add) / (1.0 + gains) + s.y0 - wanted
+        limit = MOST * abs(s.Y)
+        self.is_limited = bool(np.abs(change).max() > limit)
+        return wanted + np.clip(change, -limit, limit)

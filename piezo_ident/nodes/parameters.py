@@ -282,6 +282,13 @@ FEEDFORWARD = (
         'ramp_slew', 20.0, 'top speed of the ramps to rest and into a reference', 'V/s', 0.001, 1e6
     ),
     Declaration(
+        'follow',
+        'off',
+        'what the voltage makes up for as the displacement tells: nothing, offset and creep, or '
+        'the gain of the stage, too',
+        choices=('off', 'offset', 'gain'),
+    ),
+    Declaration(
         'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0
     ),
     Declaration(

@@ -11,6 +11,7 @@ from graph import Graph, in_time
 import numpy as np
 import pytest
 from std_msgs.msg import Float64MultiArray
+import yaml
 
 SIZE = 200
 #: how long a reference pauses before it has ended [s]
@@ -296,6 +297,30 @@ def test_a_reference_that_is_repeated_is_learned():
 
 
 @pytest.mark.timed
+def test_a_gain_that_changed_is_made_up_for_on_request(lab):
+    # of a model whose stage has a gain of 3 % more
+    scaling = {**yaml.safe_load(paper())['scaling']}
+    scaling['Y'] /= 1.03
+    text = paper(scaling=scaling, identification={'errors': {'held_out': 0.01}})
+    errors = lab.collect('tracking_error')
+    for follow, least, most in (('off', 2.0, 3.0), ('gain', 0.0, 0.1)):
+        before = lab.status('feedforward').get('models', '0')
+        assert lab.set('feedforward', 'follow', follow) == (True, '')
+        lab.wait(lambda n=before: lab.status('feedforward')['models'] != n, 'the parameter')
+        given(lab, text)
+        assert lab.call('feedforward/start')[0]
+        is_in(lab, 'ready')
+        del errors[:]
+        x = reference(1.5)
+        sent(lab, x)
+        is_in(lab, 'done')
+        lab.wait(lambda n=x.size: sum(b.t.size for b in errors) >= n, 'the errors')
+        e = column(errors)[1][FS : x.size]
+        assert least <= 100.0 * np.sqrt(np.mean(e**2)) / np.ptp(x) <= most
+    assert float(lab.diagnostics('feedforward')['gain/value']) == pytest.approx(0.03, abs=2e-3)
+    assert lab.set('feedforward', 'follow', 'off') == (True, '')
+
+
 def test_a_signal_ramps_to_rest(lab):
 
     handle = lab.handle('feedforward')
