@@ -209,6 +209,13 @@ MODEL = (
         100_000,
     ),
     Declaration('observe_gain', False, 'whether the estimate follows the gain of the stage, too'),
+    Declaration(
+        'adapt',
+        'off',
+        'what the estimate learns slowly: nothing, the gain, or the hysteresis and creep, too',
+        choices=('off', 'gain', 'hysteresis'),
+    ),
+    Declaration('output', '', 'file into which ~/save writes what was learnt; empty: none'),
 )
 
 RECORDER = (
