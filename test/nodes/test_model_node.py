@@ -352,6 +352,13 @@ def test_what_is_learnt_is_written_on_request_and_forgotten_on_another(fast, tmp
     # predictions of an earlier test may still come
     predictions = fast.collect('prediction')
     judged(fast, [replace(b, segment='learn') for b in blocks(40_000)], y)
+    own = []
+
+    def all_came():
+        own[:] = [b for b in predictions if b.segment == 'learn']
+        return len(own) == 400
+
+    fast.wait(all_came, 'the predictions')
     fast.wait(lambda: float(fast.diagnostics('model').get('learnt/gain', 0)) > 0.029, 'the gain')
     ok, said = fast.call('model/save')
     assert not ok and "'output' is empty" in said
@@ -362,8 +369,7 @@ def test_what_is_learnt_is_written_on_request_and_forgotten_on_another(fast, tmp
     assert np.abs(learnt.simulate(v) - y).max() < 2e-8
     assert learnt.identification['adaptation'][0]['gain']['value'] == pytest.approx(0.03, abs=1e-3)
     # the prediction is of the model as given
-    rows = column([b for b in predictions if b.segment == 'learn'])
-    assert np.array_equal(rows[1], prediction)
+    assert np.array_equal(column(own)[1], prediction)
     ok, said = fast.call('model/restore')
     assert ok and 'as it was given' in said
     assert fast.set('model', 'adapt', 'off') == (True, '')
