@@ -16,11 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import DataError
+from piezo_ident.fitting.adaptation import Adaptation, Learns, Recalled
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
 from piezo_ident.record.blocks import Samples
 
 #: what an observer tells of its corrections, and of which of its numbers
@@ -34,6 +36,8 @@ CORRECTIONS = {
 }
 #: the same of a gain that is followed
 GAIN = {'gain/value': 'gain', 'gain/std': 'gain_std'}
+#: the names of what is learnt
+LEARNT = ('learnt/gain', 'learnt/loop')
 #: corrections a second
 RATE = 50.0
 #: share of the span by which the band of unknown plays may shrink in a block that is judged: while
@@ -45,6 +49,11 @@ FAINT = 1e-4
 SURE = 3.0
 #: time of the stream for which displacement is waited for [s]
 PATIENCE = 0.5
+#: time constant by which a wanted motion takes over what is found: a step would excite the modes
+#: of a stage [s] (taste)
+FADE = 0.01
+#: what it takes over at most, as a share of the span: a sensor may be at fault (taste)
+MOST = 0.1
 
 
 def gain_change(value: float, std: float) -> str:
@@ -96,6 +105,9 @@ class Corrector:
         Whether the gain is followed, too.
     rate : float, optional
         Corrections that are told a second of the stream.
+    adapt : {'off', 'gain', 'hysteresis'}, optional
+        What the estimate learns of the stage: what the observer corrects is then the free run of
+        the model that was learnt.
 
     Attributes
     ----------
@@ -103,9 +115,13 @@ class Corrector:
         The corrections that were told last.
     """
 
-    def __init__(self, horizon: int = HORIZON, gain: bool = False, rate: float = RATE) -> None:
-        self._horizon, self._gain, self._rate = horizon, gain, rate
+    def __init__(
+        self, horizon: int = HORIZON, gain: bool = False, rate: float = RATE, adapt: Learns = 'off'
+    ) -> None:
+        self._horizon, self._gain, self._rate, self._adapt = horizon, gain, rate, adapt
         self._model: StageModel | None = None
+        self._adaptation: Adaptation | None = None
+        self._is_new = False
         self.told: dict[str, float] = {}
         self._bin = -1
         self._forget()
@@ -122,16 +138,53 @@ class Corrector:
         """Displacement of the model over its range [m]; infinite without a model."""
         return abs(self._model.scaling.Y) if self._model is not None else np.inf
 
-    def set_model(self, model: StageModel) -> None:
-        """Take the model that predicts from now on."""
-        self._model = model
-        self._forget()
+    def set_model(self, model: StageModel, recalled: Recalled = StageModel.stream) -> None:
+        """
+        Take the model that predicts from now on.
 
-    def set_up(self, horizon: int, gain: bool) -> None:
-        """Take another horizon, or follow the gain or not, and begin anew."""
-        self._horizon, self._gain = horizon, gain
+        `recalled` makes of a model a run under the voltage so far; at rest when absent.
+        """
+        self._model = model
+        self._learn_anew(recalled)
+
+    def set_up(
+        self, horizon: int, gain: bool, adapt: Learns, recalled: Recalled = StageModel.stream
+    ) -> None:
+        """Take another horizon, or follow the gain or not, or learn, and begin anew."""
+        self._horizon, self._gain, self._adapt = horizon, gain, adapt
+        self._learn_anew(recalled)
+
+    def _learn_anew(self, recalled: Recalled) -> None:
+        self._adaptation, self._is_new = None, True
+        if self._model is not None and self._adapt != 'off':
+            self._adaptation = Adaptation(self._model, self._adapt, self._horizon, recalled)
         self.told = {}
         self._forget()
+
+    @property
+    def learnt(self) -> StageModel:
+        """The model with what was learnt; DataError where nothing is."""
+        if self._adaptation is None:
+            raise DataError('nothing is learnt: there is no model, or the parameter adapt is off')
+        return self._adaptation.learnt_model
+
+    def restore(self) -> str:
+        """Forget what was learnt; return what that was."""
+        said = self.learnt.identification['adaptation'][-1]['seconds']
+        if self._adaptation is not None:
+            self._adaptation.restore()
+        return f'the model is as it was given; forgotten: what {said:g} s of motion told'
+
+    def ahead(self, lead: int, n: int) -> tuple[Array, float]:
+        """
+        Return what offset and creep [m] will be, shape (n,), and the relative change of the gain.
+
+        The first of the samples comes `lead` samples behind the last voltage.
+        """
+        if self._observer is None:
+            return np.zeros(n), 0.0
+        waiting = sum(block.v.size for block in self._waiting)
+        return self._observer.ahead(lead + waiting, n)
 
     def accept(self) -> str:
         """Take the present step of the sensor as its zero; return what was accepted."""
@@ -151,6 +204,8 @@ class Corrector:
             parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
         if said := gain_change(gain, std):
             parts.append(said)
+        learnt = [(name, self.told.get(name, 0.0)) for name in LEARNT]
+        parts += [f'{name.replace("/", " ")} {100.0 * x:+.2g} %' for name, x in learnt if x]
         return ', '.join(parts)
 
     def _forget(self) -> None:
@@ -162,6 +217,8 @@ class Corrector:
         # decided
         self._next, self._told, self._decided = 0, -1, -1
         self._last: tuple[float, float] | None = None
+        # whether what is left is no matter of plays that become known
+        self._is_settled = True
 
     def predicted(self, prediction: Samples, voltage: Samples, known: bool) -> list[Estimated]:
         """
@@ -185,6 +242,9 @@ class Corrector:
             model = self._model
             if model.is_static:
                 model = replace(model, sample_rate=1.0 / period)
+            if self._adaptation is not None and not self._is_new:
+                self._adaptation.begin()
+            self._is_new = False
             self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
         elif kind is Kind.GAP and self._last is not None:
             # as the prediction went on, over a straight line
@@ -202,7 +262,7 @@ class Corrector:
 
     def measured(self, t: Array, y: Array) -> list[Estimated]:
         """Take displacement [m] of times that were predicted; return what can be estimated."""
-        if self._observer is None:
+        if self._observer is None or np.isnan(self._clock.period):
             return []
         ticks = np.rint((t - self._clock.begin) / self._clock.period).astype(np.int64)
         self._measured.append((ticks, y))
@@ -227,15 +287,25 @@ class Corrector:
                 here = (ticks >= first) & (ticks < end)
                 y[ticks[here] - first] = values[here]
             self._measured = [part for part in self._measured if part[0][-1] >= end]
-            seen = self._observer.process(block.v, block.prediction.values, y)
+            free = self._learnt_run(block, y)
+            seen = self._observer.process(block.v, free, y)
+            self._is_settled = bool(np.ptp(seen.band) <= SETTLED * self.span)
             if np.isnan(block.prediction.t[0]):
                 # nobody saw the voltage
                 self._observer.lose_memory()
                 continue
             samples = replace(block.prediction, values=seen.estimate)
-            is_settled = bool(np.ptp(seen.band) <= SETTLED * self.span)
-            done.append(Estimated(samples, seen, self._tell(samples.t, seen), is_settled))
+            done.append(Estimated(samples, seen, self._tell(samples.t, seen), self._is_settled))
         return done
+
+    def _learnt_run(self, block: _Block, y: Array) -> Array:
+        """Return the free run of the model that was learnt, from displacement a horizon before."""
+        free = block.prediction.values
+        if self._adaptation is None:
+            return free
+        ticks = np.arange(block.tick, block.tick + free.size, dtype=np.float64)
+        t = self._clock.begin + ticks * self._clock.period
+        return self._adaptation.process(block.v, t, free, y, self._is_settled)
 
     def _tell(self, t: Array, seen: Observed) -> list[dict[str, float]]:
         """Return the corrections that begin a stretch."""
@@ -243,6 +313,84 @@ class Corrector:
         # rounding may put a sample just before its stretch
         bins = np.floor(t * self._rate + 1e-6).astype(np.int64)
         first = np.flatnonzero(np.diff(bins, prepend=self._bin)).tolist()
-        rows = [{n: float(getattr(seen, x)[k]) for n, x in names.items()} for k in first]
+        learnt = {} if self._adaptation is None else self._adaptation.told
+        rows = [{n: float(getattr(seen, x)[k]) for n, x in names.items()} | learnt for k in first]
         self._bin, self.told = int(bins[-1]), rows[-1] if rows else self.told
         return rows
+
+
+class Follower:
+    """
+    Moves a wanted motion by what the stage is off, so that the stage goes where it is wanted.
+
+    What a model makes of the corrected motion is that motion; the stage adds offset, creep and
+    gain to it.
+
+    Parameters
+    ----------
+    model : StageModel
+    gain : bool
+        Whether the gain is followed, too.
+    step : float
+        Largest change of the correction from one sample to the next [m].
+    stream : Stream, optional
+        A run of the model up to now; at rest when absent.
+    known : bool, optional
+        Whether that run has the memory of the plays.
+
+    Attributes
+    ----------
+    corrector : Corrector
+    is_limited : bool
+        Whether the last correction was as large as it may be.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        gain: bool,
+        step: float,
+        stream: Stream | None = None,
+        known: bool = False,
+    ) -> None:
+        self.corrector, self._model, self._step = Corrector(gain=gain), model, step
+        self.corrector.set_model(model)
+        self._stream, self._known = stream or model.stream(), known
+        self._newest = -np.inf
+        # what is applied of what the stage adds [m], and of its gain
+        self._offset = self._gain = 0.0
+        self.is_limited = False
+
+    def drove(self, t: Array, v: Array) -> None:
+        """Take the voltage [V] that left, with its time [s]; at least one sample."""
+        self._newest = float(t[-1])
+        prediction = Samples(t, self._stream.process(v, t))
+        self.corrector.predicted(prediction, Samples(t, v), self._known)
+
+    def measured(self, samples: Samples) -> None:
+        """Take a block of displacement; what is no number, or ahead of the voltage, is none."""
+        usable = np.isfinite(samples.values) & (samples.t <= self._newest)
+        if usable.any():
+            self.corrector.measured(samples.t[usable], samples.values[usable])
+
+    def process(self, wanted: Array, lead: int) -> Array:
+        """
+        Return the next samples of a wanted motion [m], corrected; shapes (n,).
+
+        The first of them is wanted `lead` samples behind the last voltage.
+        """
+        n, s = wanted.size, self._model.scaling
+        offset, gain = self.corrector.ahead(lead + n - 1, 1)
+        share = 1.0 - np.exp(-n / (FADE * self._model.sample_rate))
+        most = n * self._step
+        way = float(np.clip(share * (offset[0] - self._offset), -most, most))
+        most /= abs(s.Y)
+        turn = float(np.clip(share * (np.clip(gain, -MOST, MOST) - self._gain), -most, most))
+        part = np.arange(1, n + 1) / n
+        add = self._offset + way * part
+        gains = self._gain + turn * part
+        self._offset, self._gain = self._offset + way, self._gain + turn
+        change = (wanted - s.y0 - add) / (1.0 + gains) + s.y0 - wanted
+        limit = MOST * abs(s.Y)
+        self.is_limited = bool(np.abs(change).max() > limit)
+        return wanted + np.clip(change, -limit, limit)

@@ -99,7 +99,7 @@ class Predictor:
         if np.isfinite(self._clock.period):
             self._check_rate(model)
         self.model = model
-        self._stream = self._caught_up(model) if self._past else None
+        self._stream = self.caught_up(model) if self._past else None
         if self._past and self.problem.startswith('the stream'):
             self.problem = ''
 
@@ -111,8 +111,11 @@ class Predictor:
             f'{model.sample_rate:g} Hz; identify a model at the rate of the stream'
         )
 
-    def _caught_up(self, model: StageModel) -> Stream:
+    def caught_up(self, model: StageModel) -> Stream:
+        """Return a run of a model under the voltage so far; at rest where there was none."""
         stream = model.stream()
+        if not self._past:
+            return stream
         t, v = self._past.recall(stream, model, self._clock.period)
         stream.process(v, t)
         return stream

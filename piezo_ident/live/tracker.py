@@ -20,10 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.control.inverse import FAR
 from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
+from piezo_ident.live.corrector import Follower
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.history import History
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
+from piezo_ident.record.blocks import Samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +51,11 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Successor:
-    """A model that has been brought up to `count` samples of voltage."""
+    """A model that has been brought up to `count` samples of voltage, and a run of it."""
 
     inverse: LiveInverse
     count: int
+    run: Stream | None = None
 
 
 class Tracker:
@@ -66,6 +71,14 @@ class Tracker:
         At the rate of the model.
     preview : int, optional
         Samples by which the stage follows later.
+    follow : {'off', 'offset', 'gain'}, optional
+        What the voltage makes up for of what displacement tells: nothing, offset and creep of
+        earlier motion, or the gain of the stage besides.
+
+    Attributes
+    ----------
+    follower : Follower or None
+        None where it makes up for nothing.
 
     Raises
     ------
@@ -83,8 +96,14 @@ class Tracker:
     (True, 30.0)
     """
 
-    def __init__(self, model: StageModel, settings: GuardSettings, preview: int = PREVIEW) -> None:
-        self.settings, self.preview = settings, preview
+    def __init__(
+        self,
+        model: StageModel,
+        settings: GuardSettings,
+        preview: int = PREVIEW,
+        follow: str = 'off',
+    ) -> None:
+        self.settings, self.preview, self.follow = settings, preview, follow
         self._inverse = self._built(model)
         self._lock = threading.Lock()
         self.reset()
@@ -96,6 +115,15 @@ class Tracker:
         start = self._inverse.position
         self._raw = self._wanted = np.full(self.preview, start)
         self._join = _Join(start, self._step())
+        self.follower = self._new_follower()
+
+    def _new_follower(self, stream: Stream | None = None) -> Follower | None:
+        if self.follow == 'off':
+            return None
+        before = None if stream is None else self.follower
+        known = before is not None and before.corrector.knows_memory
+        gain, model = self.follow == 'gain', self._inverse.model
+        return Follower(model, gain, self._step(), stream, known)
 
     @property
     def inverse(self) -> LiveInverse:
@@ -154,10 +182,21 @@ class Tracker:
         wanted = self._join.process(raw)
         self._raw = np.append(self._raw, raw)[-self.preview :]
         self._wanted = np.append(self._wanted, wanted)
-        driven = self._inverse.process(wanted)
+        driven = self._inverse.process(self._corrected(wanted))
         v = self._guard.process(driven.v).voltage
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
         return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
+
+    def _corrected(self, wanted: Array) -> Array:
+        """Return a wanted motion as the model must move for the stage to be there."""
+        if self.follower is None:
+            return wanted
+        return self.follower.process(wanted, self.preview + 1)
+
+    def measured(self, samples: Samples) -> None:
+        """Take displacement [m] of times of the voltage."""
+        if self.follower is not None:
+            self.follower.measured(samples)
 
     def finish(self) -> Drive:
         """Return the voltage for what of the reference is still ahead; its last sample stays."""
@@ -182,6 +221,8 @@ class Tracker:
         if v.size:
             with self._lock:
                 self._past.add(t, v)
+            if self.follower is not None:
+                self.follower.drove(t, v)
         return t
 
     # another model
@@ -196,11 +237,15 @@ class Tracker:
         past : History
             A snapshot, see `past`.
         """
-        inverse = self._built(model)
+        inverse, run = self._built(model), None
         if past:
-            _, v = past.recall(inverse, model, 1.0 / self.settings.sample_rate)
+            period = 1.0 / self.settings.sample_rate
+            _, v = past.recall(inverse, model, period)
             inverse.follow(v, past.count - v.size)
-        return Successor(inverse, past.count)
+            if self.follow != 'off':
+                run = inverse.model.stream()
+                run.process(*past.recall(run, inverse.model, period)[::-1])
+        return Successor(inverse, past.count, run)
 
     def past(self) -> History:
         """Return a snapshot of the voltage so far; from any thread."""
@@ -213,8 +258,14 @@ class Tracker:
         if not self.tick:
             self.reset()
             return
+        run = successor.run
         if self.tick > successor.count:
-            self._inverse.follow(self._past.since(successor.count), successor.count)
+            v = self._past.since(successor.count)
+            self._inverse.follow(v, successor.count)
+            if run is not None:
+                t = np.arange(successor.count, self.tick) / self.settings.sample_rate
+                run.process(v, t)
+        self.follower = self._new_follower(run)
         # the voltage is on its way: so must the wanted motion be
         self._join = _Join(self._inverse.position, self._step(), moves=True)
         self._wanted = self._join.process(self._raw)
@@ -233,6 +284,23 @@ def held(x: Array, before: float) -> Array:
         return x
     last = np.where(good, np.arange(1, x.size + 1), 0)
     return np.append(before, x)[np.maximum.accumulate(last)]
+
+
+def bridged(x: Array, before: float, missing: int) -> Array:
+    """Return samples behind a straight line over those that are missing before them."""
+    share = np.arange(1, missing + 1) / (missing + 1)
+    return np.append(before + (x[0] - before) * share, x)
+
+
+def check_unit(model: StageModel, x: Array) -> None:
+    """Refuse a block of a reference that is nowhere near the stage, with a DataError."""
+    s = model.scaling
+    least = float(np.nanmin(np.abs(x - s.y0), initial=np.inf))
+    if FAR * abs(s.Y) < least < np.inf:
+        raise DataError(
+            f'it wants the stage {1e6 * least:.3g} um away, which moves by '
+            f'{1e6 * abs(s.Y):.3g} um; is the reference in metres?'
+        )
 
 
 class _Join:

@@ -249,6 +249,20 @@ class Observer:
         kernel.forget_refused(now)
         return float(self.model.scaling.Y * step)
 
+    def ahead(self, lead: int, n: int) -> tuple[Array, float]:
+        """
+        Return what offset and creep [m] will be, shape (n,), and the relative change of the gain.
+
+        The first of the samples comes `lead` samples behind the last one that was processed.
+        """
+        if not self._started:
+            return np.zeros(n), 0.0
+        now, left = self._state.now, self._law.left
+        decay = left ** np.arange(lead, lead + n)[:, None]
+        return self.model.scaling.Y * (now[kernel.OFFSET] + decay @ self._state.coming), float(
+            now[kernel.GAIN]
+        )
+
     def process(self, v: Array, free: Array, measured: Array) -> Observed:
         """
         Return the estimate of the next samples; all shapes (n,).

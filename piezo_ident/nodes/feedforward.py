@@ -13,6 +13,9 @@ does.  Nothing leaves the limits, nor is faster than `slew`.
 ``~/learn`` repeats the last reference, corrects the voltage by what was measured, and ends when
 the error falls no more; called again, it goes on from the best.
 
+With `follow` an observer finds offset, creep of earlier motion, and gain in the displacement, and
+the voltage makes up for them.
+
 A model that is refined takes over while the stage moves: without a step in the voltage, and with
 the memory that it would have if it had run from the start.
 
@@ -38,13 +41,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.control.inverse import FAR
+from piezo_ident.live.corrector import MOST
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Looks, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
-from piezo_ident.live.tracker import Drive, held, Successor, Tracker
+from piezo_ident.live.tracker import bridged, check_unit, Drive, held, Successor, Tracker
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
@@ -55,11 +58,13 @@ from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
 #: parameters that are taken over between two references
-LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew')
+LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew', 'follow')
 #: faults whose samples or blocks are counted
 FAULTS = ('lost', 'refused', 'not_finite', 'clipped')
 #: how long a stage may answer nothing to a reference that goes on, before it is told [s]
 SILENT = 1.0
+#: what is told where more is not made up for
+LIMITED = f'the stage is off by {MOST:.0%} of its stroke or more: is the sensor right?'
 
 
 class FeedforwardNode(DrivingNode):
@@ -126,10 +131,10 @@ class FeedforwardNode(DrivingNode):
 
     def _prepared(self, model: StageModel) -> tuple[StageModel, Tracker | Successor]:
         # by the thread of the loader
-        tracker, settings = self._tracker, self._settings()
-        if tracker is None or tracker.settings != settings:
+        tracker, settings, follow = self._tracker, self._settings(), self.values['follow']
+        if tracker is None or (tracker.settings, tracker.follow) != (settings, follow):
             preview = max(1, round(self.values['preview'] * self._rate_of_clock))
-            return model, Tracker(model, settings, preview)
+            return model, Tracker(model, settings, preview, follow)
         return model, tracker.successor(model, tracker.past())
 
     def _take_model(
@@ -209,7 +214,8 @@ class FeedforwardNode(DrivingNode):
         sequence = info.get('publication_sequence_number')
         try:
             samples = from_message(message, 'reference')
-            self._check_unit(samples.values)
+            if self._model is not None:
+                check_unit(self._model, samples.values)
         except DataError as error:
             self._sample_clock.skip(sequence)
             self._faults.note('refused', f'a block is refused: {error}')
@@ -217,18 +223,6 @@ class FeedforwardNode(DrivingNode):
             self._take(samples, sequence)
             self._busy += time.perf_counter() - begin
         self.report_state()
-
-    def _check_unit(self, x: NDArray[np.float64]) -> None:
-        """Refuse a block that is nowhere near the stage."""
-        if self._model is None:
-            return
-        s = self._model.scaling
-        least = float(np.nanmin(np.abs(x - s.y0), initial=np.inf))
-        if FAR * abs(s.Y) < least < np.inf:
-            raise DataError(
-                f'it wants the stage {1e6 * least:.3g} um away, which moves by '
-                f'{1e6 * abs(s.Y):.3g} um; is the reference in metres?'
-            )
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
         verdict = self._sample_clock.judge(
@@ -243,9 +237,7 @@ class FeedforwardNode(DrivingNode):
             self._faults.note('not_finite', f'{bad} {about}', bad)
         if verdict.kind is Kind.GAP:
             self._faults.note('lost', verdict.reason, verdict.missing)
-            share = np.arange(1, verdict.missing + 1) / (verdict.missing + 1)
-            before = self._last_value
-            x = np.append(before + (x[0] - before) * share, x)
+            x = bridged(x, self._last_value, verdict.missing)
         self._last = time.monotonic()
         if not self._labels or self._labels[-1][1] != samples.segment:
             self._labels.append((self._heard, samples.segment))
@@ -302,6 +294,8 @@ class FeedforwardNode(DrivingNode):
         self._tell(self._error.measured(samples))
         if self._learner is not None:
             self._learner.measured(samples)
+        if self._tracker is not None:
+            self._tracker.measured(samples)
 
     def _tell(self, errors: list[Samples]) -> None:
         for block in errors:
@@ -383,6 +377,10 @@ class FeedforwardNode(DrivingNode):
             inverse = self._tracker.inverse
             values['delay'] = f'{self._tracker.preview / self._rate_of_clock:.6g}'
             values['passes'], values['expected'] = inverse.passes, f'{inverse.error:.3g}'
+            if follower := self._tracker.follower:
+                values |= {name: f'{x:.6g}' for name, x in follower.corrector.told.items()}
+                if follower.is_limited:
+                    self._faults.note('limited', LIMITED, 0)
         if rate:
             values['head_room'] = f'{max(0.0, 1.0 - worked * self._rate_of_clock / rate):.3f}'
         if self._told is not None:

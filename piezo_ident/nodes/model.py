@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 import functools
+from pathlib import Path
 import time
 from typing import Any
 
@@ -18,6 +19,7 @@ from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, Previ
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import ModelLoader, no_file
 from piezo_ident.nodes.wire import from_message, PREVIEW, STREAM, to_message
@@ -44,7 +46,7 @@ class ModelNode(LabNode):
         self._predictor, self._matcher = Predictor(), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
-        values = [self.values[name] for name in ('horizon', 'observe_gain', 'preview_rate')]
+        values = [self.values[n] for n in ('horizon', 'observe_gain', 'preview_rate', 'adapt')]
         self._corrector, self._estimates = Corrector(*values), Matcher()
         # of the estimate
         self._left = LiveError(self.values['window'])
@@ -58,6 +60,8 @@ class ModelNode(LabNode):
         self._again = 0
         self._models = 0
         self.offer('accept', self._corrector.accept)
+        self.offer('save', self._save)
+        self.offer('restore', self._corrector.restore)
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
@@ -75,7 +79,7 @@ class ModelNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a model file that is not there; what is wrong inside is in ``~/status``."""
-        return no_file(value) if name == 'model' else None
+        return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, or another window."""
@@ -83,16 +87,17 @@ class ModelNode(LabNode):
             self._loader.load_file(path)
         if 'window' in changed:
             self._error.window = self._left.window = changed['window']
-        if {'horizon', 'observe_gain'} & set(changed):
+        if {'horizon', 'observe_gain', 'adapt'} & set(changed):
             new = {**self.values, **changed}
-            self._corrector.set_up(new['horizon'], new['observe_gain'])
+            h, gain, adapt = (new[name] for name in ('horizon', 'observe_gain', 'adapt'))
+            self._corrector.set_up(h, gain, adapt, self._predictor.caught_up)
             self._left.clear()
 
     def _take_model(self, model: StageModel | None, source: str) -> None:
         try:
             if model is not None:
                 self._predictor.set_model(model)
-                self._corrector.set_model(model)
+                self._corrector.set_model(model, self._predictor.caught_up)
         except PiezoIdentError as error:
             model, source = None, f'{source}: {error}'
         if model is None:
@@ -105,6 +110,13 @@ class ModelNode(LabNode):
             # the state stays what it was
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
         self._forget_errors()
+
+    def _save(self) -> str:
+        learnt, path = self._corrector.learnt, self.values['output']
+        if not path:
+            raise DataError("parameter 'output' is empty; set it to the file to write")
+        learnt.save(Path(path).expanduser())
+        return f'{path}: the model with what was learnt'
 
     def _forget_errors(self) -> None:
         self._error.clear()

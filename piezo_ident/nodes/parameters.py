@@ -209,6 +209,13 @@ MODEL = (
         100_000,
     ),
     Declaration('observe_gain', False, 'whether the estimate follows the gain of the stage, too'),
+    Declaration(
+        'adapt',
+        'off',
+        'what the estimate learns slowly: nothing, the gain, or the hysteresis and creep, too',
+        choices=('off', 'gain', 'hysteresis'),
+    ),
+    Declaration('output', '', 'file into which ~/save writes what was learnt; empty: none'),
 )
 
 RECORDER = (
@@ -280,6 +287,13 @@ FEEDFORWARD = (
     ),
     Declaration(
         'ramp_slew', 20.0, 'top speed of the ramps to rest and into a reference', 'V/s', 0.001, 1e6
+    ),
+    Declaration(
+        'follow',
+        'off',
+        'what the voltage makes up for as the displacement tells: nothing, offset and creep, or '
+        'the gain of the stage, too',
+        choices=('off', 'offset', 'gain'),
     ),
     Declaration(
         'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0

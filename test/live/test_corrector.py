@@ -9,10 +9,12 @@ import itertools
 import numpy as np
 from numpy.testing import assert_allclose
 from paper_stage import FS, PAPER
+from piezo_ident.common.errors import DataError
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.monitor import Matcher
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.observer import observe
+from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 import pytest
@@ -144,3 +146,49 @@ def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():
         if first < 100:
             corrector.measured(T[cut], Y[cut])
         assert corrector.knows_memory == knows
+
+
+def test_what_is_learnt_is_in_the_estimate_and_outlives_a_restart():
+    line = Line()
+    line.corrector = Corrector(adapt='gain')
+    line.corrector.set_model(MODEL)
+    y = 1.03 * MODEL.simulate(V)
+    for start in (0, 1):
+        line.got.clear()
+        for k in range(0, N, 100):
+            cut = slice(k, k + 100)
+            line.voltage(cut)
+            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        t, estimate = line.rows
+        # the second time it is known from the start
+        first = 0 if start else 8000
+        assert np.abs(estimate - y)[t >= T[first]].max() < 3e-8
+        assert line.corrector.told['learnt/gain'] == pytest.approx(0.03, abs=1e-3)
+        assert 'learnt gain +3 %' in line.corrector.corrected
+    learnt = line.corrector.learnt
+    assert learnt.hysteresis.p2 == pytest.approx(1.03 * MODEL.hysteresis.p2, rel=1e-3)
+    assert 's of motion' in line.corrector.restore()
+    assert line.corrector.learnt.hysteresis.p2 == MODEL.hysteresis.p2
+    with pytest.raises(DataError, match='adapt'):
+        Corrector().restore()
+
+
+def test_a_model_that_comes_later_learns_as_one_from_the_start():
+    creep = EffectSetting('creep', {'gain': [0.02], 'time_constant': [1.0]})
+    model, got = replace(MODEL, effects=(creep,)), []
+    y = 1.03 * model.simulate(V)
+    for late in (False, True):
+        line = Line()
+        line.predictor.set_model(model)
+        line.corrector = Corrector(adapt='hysteresis')
+        line.corrector.set_model(model)
+        for k in range(0, N, 100):
+            if late and k == 2000:
+                line.corrector.set_up(100, False, 'hysteresis', line.predictor.caught_up)
+                line.got.clear()
+            cut = slice(k, k + 100)
+            line.voltage(cut)
+            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        got.append((line.rows[1][-2000:], line.corrector.told['learnt/gain']))
+    assert_allclose(*(x for x, _ in got), rtol=0, atol=2e-8)
+    assert got[1][1] == pytest.approx(0.03, abs=2e-3)

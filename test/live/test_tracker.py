@@ -15,6 +15,7 @@ from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.blocks import Samples
 import pytest
 
 SETTINGS = GuardSettings(0.0, 10.0, 40e3, 20.0, 0.0, FS)
@@ -116,3 +117,85 @@ def test_what_does_not_fit_is_refused():
         tracker.successor(replace(PAPER, sample_rate=10_000.0), tracker.past())
     with pytest.raises(DataError, match='at least one number'):
         tracker.process([])
+
+
+SLOW = EffectSetting('creep', {'gain': [0.02, 0.01], 'time_constant': [0.1, 5.0]})
+CREEPS = replace(PAPER, effects=(SLOW,), identification={'errors': {'held_out': 0.02}})
+
+
+def run_of(follow, gain=1.0, zero=0.0, earlier=False, seconds=1.5, readings=lambda y: y):
+    """Return tracker, voltage and error in % of the scan's span, of a stage that answers."""
+    tracker, stage = Tracker(CREEPS, SETTINGS, 400, follow=follow), CREEPS.stream()
+    if earlier:
+        way = np.linspace(0.0, 10.0, 10_000)
+        stage.process(np.concatenate([way, np.full(40_000, 10.0), way[::-4], np.zeros(2000)]))
+    x, rng = sine(seconds, 10.0), np.random.default_rng(1)
+    v, error = [], []
+    for k in range(0, x.size, 100):
+        drive = tracker.process(x[k : k + 100])
+        y = stage.process(drive.v)
+        s = CREEPS.scaling
+        y = s.y0 + (y - s.y0) * gain + zero
+        v.append(drive.v)
+        error.append(y - drive.wanted)
+        measured = readings(y + 1.5e-9 * rng.standard_normal(y.size))
+        tracker.measured(Samples(drive.t, measured))
+    return tracker, np.concatenate(v), 100.0 * np.concatenate(error) / np.ptp(x)
+
+
+@pytest.mark.parametrize(
+    ('case', 'alone'),
+    [
+        ({'earlier': True}, 0.4),
+        ({'gain': 1.03}, 2.0),
+        ({'gain': 1.03, 'earlier': True}, 2.0),
+        ({'zero': 0.4e-6}, 0.5),
+    ],
+)
+def test_the_voltage_makes_up_for_creep_gain_and_zero(case, alone):
+    def rms(error):
+        return np.sqrt(np.mean(error[int(FS) // 2 :] ** 2))
+
+    tracker, v, error = run_of('gain', **case)
+    assert rms(error) < 0.03
+    assert rms(run_of('off', **case)[2]) > alone
+    assert np.abs(np.diff(v)).max() <= SETTINGS.step * (1 + 1e-9)
+    assert v.min() >= 0.0 and v.max() <= 10.0
+    assert tracker.follower.corrector.told['gain/value'] == pytest.approx(
+        case.get('gain', 1.0) - 1.0, abs=1e-3
+    )
+    assert not tracker.follower.is_limited
+
+
+def test_what_follows_costs_nothing_where_nothing_changed():
+    assert np.abs(run_of('gain')[2] - run_of('off')[2]).max() < 0.02
+
+
+def test_a_sensor_at_fault_moves_the_stage_by_a_tenth_of_its_stroke_at_most():
+    # it reads the negative of the motion from the start, so that nothing else is known of it
+    tracker, v, error = run_of('gain', seconds=5.6, readings=lambda y: 60e-6 - 2.0 * y)
+    span = 40e-6
+    assert np.abs(error).max() < 100.0 * 0.105 * abs(CREEPS.scaling.Y) / span
+    assert tracker.follower.is_limited
+    assert np.abs(np.diff(v)).max() <= SETTINGS.step * (1 + 1e-9)
+
+
+def test_without_readings_it_goes_on_as_alone():
+    alone, lost = run_of('off')[1], run_of('gain', readings=lambda y: np.full(y.size, np.nan))[1]
+    assert np.array_equal(alone, lost)
+
+
+def test_another_model_takes_over_and_is_followed_anew():
+    tracker, stage, x = Tracker(PAPER, SETTINGS, follow='gain'), CREEPS.stream(), sine(2.0, 10.0)
+    v, error = [], []
+    for k in range(0, x.size, 100):
+        if k == int(FS) // 2:
+            tracker.take_over(tracker.successor(CREEPS, tracker.past()))
+        drive = tracker.process(x[k : k + 100])
+        y = stage.process(drive.v)
+        tracker.measured(Samples(drive.t, y))
+        v.append(drive.v)
+        error.append(y - drive.wanted)
+    # the motion itself moves by 0.21 V from sample to sample
+    assert np.abs(np.diff(np.concatenate(v)[int(FS) // 4 :])).max() < 0.03
+    assert np.sqrt(np.mean(np.concatenate(error)[-int(FS) // 2 :] ** 2)) < 1e-3 * 40e-6

@@ -3,12 +3,14 @@
 
 """The feedforward node as a process, with a simulated stage; the reference is the test's."""
 
+from dataclasses import replace
 import re
 import time
 
-from course import block, column, FS, paper
+from course import block, column, FS, model_of, paper
 from graph import Graph, in_time
 import numpy as np
+from piezo_ident.model.files import model_to_yaml
 import pytest
 from std_msgs.msg import Float64MultiArray
 
@@ -293,6 +295,30 @@ def test_a_reference_that_is_repeated_is_learned():
         assert g.finish('feedforward/learn')['state'] == 'done'
         again = g.status('feedforward')['text']
         assert float(again.split()[0]) <= best * 1.001
+
+
+def test_a_gain_that_changed_is_made_up_for_on_request(lab):
+    # of a model whose stage has a gain of 3 % more
+    model = model_of(paper(identification={'errors': {'held_out': 0.01}}))
+    scaling = replace(model.scaling, Y=model.scaling.Y / 1.03)
+    text = model_to_yaml(replace(model, scaling=scaling))
+    errors = lab.collect('tracking_error')
+    given(lab, text)
+    for follow, least, most in (('off', 2.0, 3.0), ('gain', 0.0, 0.1)):
+        before = lab.status('feedforward')['models']
+        assert lab.set('feedforward', 'follow', follow) == (True, '')
+        lab.wait(lambda n=before: lab.status('feedforward')['models'] != n, 'the parameter')
+        assert lab.call('feedforward/start')[0]
+        is_in(lab, 'ready')
+        del errors[:]
+        x = reference(1.5)
+        sent(lab, x)
+        is_in(lab, 'done')
+        lab.wait(lambda n=x.size: sum(b.t.size for b in errors) >= n, 'the errors')
+        e = column(errors)[1][int(FS) : x.size]
+        assert least <= 100.0 * np.sqrt(np.mean(e**2)) / np.ptp(x) <= most
+    assert float(lab.diagnostics('feedforward')['gain/value']) == pytest.approx(0.03, abs=2e-3)
+    assert lab.set('feedforward', 'follow', 'off') == (True, '')
 
 
 @pytest.mark.timed

@@ -342,6 +342,42 @@ def test_a_gain_that_changed_is_told_by_size_and_corrected_on_request(fast):
     assert fast.set('model', 'observe_gain', False) == (True, '')
 
 
+def test_what_is_learnt_is_written_on_request_and_forgotten_on_another(fast, tmp_path):
+    assert fast.set('model', 'adapt', 'hysteresis') == (True, '')
+    text = paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}})
+    reset(fast, text)
+    given = model_of(text)
+    v, t = sine(40_000)[1], np.arange(40_000) / FS
+    prediction, y = given.stream().process(v, t), 1.03 * given.stream().process(v, t)
+    # predictions of an earlier test may still come
+    predictions = fast.collect('prediction')
+    judged(fast, [replace(b, segment='learn') for b in blocks(40_000)], y)
+    own = []
+
+    def all_came():
+        own[:] = [b for b in predictions if b.segment == 'learn']
+        return len(own) == 400
+
+    fast.wait(all_came, 'the predictions')
+    fast.wait(lambda: float(fast.diagnostics('model').get('learnt/gain', 0)) > 0.029, 'the gain')
+    ok, said = fast.call('model/save')
+    assert not ok and "'output' is empty" in said
+    path = tmp_path / 'learnt.yaml'
+    assert fast.set('model', 'output', str(path)) == (True, '')
+    assert fast.call('model/save')[0]
+    learnt = load(path)
+    assert np.abs(learnt.simulate(v) - y).max() < 2e-8
+    assert learnt.identification['adaptation'][0]['gain']['value'] == pytest.approx(0.03, abs=1e-3)
+    # the prediction is of the model as given
+    assert np.array_equal(column(own)[1], prediction)
+    ok, said = fast.call('model/restore')
+    assert ok and 'as it was given' in said
+    assert fast.set('model', 'adapt', 'off') == (True, '')
+    ok, said = fast.call('model/save')
+    assert not ok and 'adapt is off' in said
+    assert fast.set('model', 'output', '') == (True, '')
+
+
 def test_a_step_of_the_sensor_is_accepted_at_once(fast):
     reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}}))
     y = model_of(paper()).stream().process(sine(24_000)[1], np.arange(24_000) / FS)

@@ -1,0 +1,281 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What a model learns slowly of a stage that runs: its gain, and on request its hysteresis.
+
+The displacement is that of the free run, plus theta_j times what each of a few changes of the
+model adds: its gain; the weights of its plays, by hats over their thresholds; its cubic; the
+shares of its creep.  Each is a run of a changed model of its own, so that amplifier, creep, G and
+delay do to it what they do to the stage.  All of that and what was measured pass a high-pass,
+which leaves offset, drift and creep of earlier motion to the observer.
+
+theta is found by recursive least squares over the means f of groups of samples, which forget what
+they tell of anew, theta_j by theta_j, and no further than to what was known before:
+
+    L <- A L A + (1 - A^2) L0 + f f' / R,      A_j^2 = 1 - (1 - mu) s_j / (s_j + e R)
+
+L is the information, L0 the diagonal one of the prior, s_j = f_j^2 / L0_jj.  A stage at rest tells
+of nothing, and nothing is forgotten.  What theta must keep (weights of plays >= 0, a rising H,
+sizes that a stage may have) are half-spaces, onto which it is moved along L^-1.  What is far from
+all that was learnt is not believed before it has lasted for longer than the high-pass remembers
+a step of the sensor; then as little is known of the stage as at first.
+
+J. E. Parkum, N. K. Poulsen and J. Holst, "Recursive forgetting algorithms", Int. J. Control 55(1),
+1992, doi:10.1080/00207179208934228.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.effects.creep import Creep
+from piezo_ident.fitting import adaptation_kernel as kernel
+from piezo_ident.model.metrics import expected_error
+from piezo_ident.model.observer import GAIN_SIZE, GATE, HORIZON, LEAST, UNKNOWN
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
+from piezo_ident.operators.hysteresis import Hysteresis
+
+#: what is learnt
+Learns = Literal['off', 'gain', 'hysteresis']
+#: makes of a model a run under the voltage so far
+Recalled: TypeAlias = Callable[[StageModel], Stream]
+
+#: time over which samples are averaged to one measurement [s]
+GROUP = 2e-3
+#: time constant of the high-pass [s]: below it lie scans, above it drift and slow creep (taste)
+SLOW = 0.3
+#: time of motion after which what was measured counts by 1 / e [s]: five of them are the 10 s in
+#: which a change is to be learnt, with a spare
+MEMORY = 1.5
+#: time for which what is not believed must last until it is [s]: the high-pass has forgotten a
+#: step of the sensor by then
+PATIENCE = 4.0 * SLOW
+#: hats over the thresholds (taste: as many as the wider laws of H have)
+HATS = 5
+#: rms size of what is learnt: of weights, of the cubic in normalised units, of the shares of creep
+#: (taste: a third)
+WEIGHTS, CUBIC, CREEP = 0.3, 0.1, 0.3
+#: most of each, in these sizes (taste)
+LARGEST = 3.0
+#: share of the weights of plays, and of the slope of H, that is left at least (taste)
+LEFT = 0.1
+#: places over the span at which the slope is watched
+PLACES = 9
+#: size of a drift, as what it leaves behind the high-pass, in spans: a micrometre a second of a
+#: span of 100 um, the first seconds of a stage that was switched on (taste)
+DRIFT = SLOW * 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A change of a model by one: its name, what the model becomes, and its rms size."""
+
+    name: str
+    model: StageModel
+    size: float
+
+
+def _changes(model: StageModel, kind: Learns) -> Iterator[Change]:
+    h = model.hysteresis
+    yield Change('gain', replace(model, hysteresis=h.scaled(2.0)), GAIN_SIZE)
+    if kind != 'hysteresis':
+        return
+    r = h.thresholds
+    if r.size:
+        nodes = np.linspace(r[0], r[-1], min(HATS, r.size))
+        for k, hat in enumerate(np.eye(nodes.size)):
+            share = np.interp(r, nodes, hat) if nodes.size > 1 else np.ones(1)
+            yield Change(f'weights_{k}', replace(model, hysteresis=_grown(h, share)), WEIGHTS)
+    yield Change('cubic', replace(model, hysteresis=replace(h, p1=h.p1 + 1.0)), CUBIC)
+    if any(e.name == Creep.name for e in model.effects):
+        yield Change('creep', _creeping(model, 2.0), CREEP)
+
+
+def _grown(h: Hysteresis, share: Array) -> Hysteresis:
+    """Return H whose plays weigh more by a share each, curves and bias with them."""
+    more = 1.0 + share
+    return replace(
+        h,
+        weights=h.weights * more,
+        curves=None if h.curves is None else h.curves * more[:, None],
+        bias=None if h.bias is None else h.bias * more,
+    )
+
+
+def _creeping(model: StageModel, times: float) -> StageModel:
+    """Return a model that creeps more, by a factor."""
+    effects = []
+    for effect in model.effects:
+        if effect.name == Creep.name:
+            gain = (times * np.asarray(effect.parameters['gain'])).tolist()
+            effect = replace(effect, parameters={**effect.parameters, 'gain': gain})
+        effects.append(effect)
+    return replace(model, effects=tuple(effects))
+
+
+class Adaptation:
+    """
+    Learns changes of a model from displacement that comes a horizon later.
+
+    The result does not depend on how a stream is cut.
+
+    Parameters
+    ----------
+    model : StageModel
+    kind : {'gain', 'hysteresis'}
+        What is learnt; the hysteresis includes the gain.
+    horizon : int, optional
+        Samples by which displacement is older than what is said with it.
+    recalled : callable, optional
+        Makes of a model a run under the voltage so far; at rest when absent.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        kind: Learns,
+        horizon: int = HORIZON,
+        recalled: Recalled = StageModel.stream,
+    ) -> None:
+        self.model, self.kind, self.horizon = model, kind, horizon
+        percent = expected_error(model)
+        held = UNKNOWN if percent is None else percent / 100.0
+        self._changes = list(_changes(model, kind))
+        self._group = max(1, round(GROUP * model.sample_rate))
+        groups = [max(1.0, t * model.sample_rate / self._group) for t in (MEMORY, PATIENCE)]
+        size = max(held, LEAST)
+        sizes = np.array([change.size for change in self._changes])
+        keep = np.exp(-1.0 / (SLOW * model.sample_rate))
+        self._law = np.array([size**2, keep, np.exp(-1.0 / groups[0]), groups[1], GATE**2])
+        # a drift stands behind what is learnt
+        self._prior = np.diag(np.append(sizes, DRIFT) ** -2.0)
+        rows = self._half_spaces(sizes)
+        self._halves = np.insert(rows, sizes.size, 0.0, axis=1)
+        self.restore()
+        self.begin(recalled)
+
+    def _half_spaces(self, sizes: Array) -> Array:
+        """Return rows a and b of what theta must keep: a theta >= b."""
+        h, n = self.model.hysteresis, sizes.size
+        names = [change.name for change in self._changes]
+        least = -LARGEST * sizes
+        weights = np.array([float(name.startswith('weights')) for name in names])
+        gain = np.array([float(name == 'gain') for name in names])
+        rows = [*np.column_stack([np.eye(n), least]), *np.column_stack([-np.eye(n), least])]
+        # of plays: a weight grows by gain and hat
+        rows += [np.append(np.eye(n)[k] + gain, LEFT - 1.0) for k in np.flatnonzero(weights)]
+        v = np.linspace(*h.span, PLACES)
+        before = h.slope_at_turns(v)
+        grown = [c.model.hysteresis.slope_at_turns(v) - before for c in self._changes]
+        for k in np.flatnonzero(before > 0.0):
+            rows.append(np.append([g[k] for g in grown], (LEFT - 1.0) * before[k]))
+        return np.array(rows)
+
+    def restore(self) -> None:
+        """Forget what was learnt."""
+        self._theta = np.zeros(len(self._changes) + 1)
+        self._information, self._now = self._prior.copy(), np.zeros(kernel.PLACES)
+        self._now[kernel.SCALE] = 1.0
+
+    def begin(self, recalled: Recalled = StageModel.stream) -> None:
+        """Begin another run; what was learnt stays."""
+        n = len(self._changes) + 1
+        self._runs = [recalled(change.model) for change in self._changes]
+        self._past = np.full((n, self.horizon), np.nan)
+        self._slow, self._sums = np.full(n, np.nan), np.zeros(n)
+        self._now[[kernel.COUNT, kernel.FINITE, kernel.REFUSED]] = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Time of motion that was learnt from [s]."""
+        return float(self._now[kernel.LEARNT]) * self._group / self.model.sample_rate
+
+    @property
+    def learnt(self) -> dict[str, tuple[float, float]]:
+        """Each change by its name, with its standard deviation."""
+        std = np.sqrt(np.diag(np.linalg.inv(self._information)))
+        rows = zip(self._changes, self._theta.tolist(), std.tolist(), strict=False)
+        return {change.name: (value, s) for change, value, s in rows}
+
+    @property
+    def told(self) -> dict[str, float]:
+        """What was learnt of the gain, and of the width of the loop, as shares."""
+        learnt = {name: x for name, (x, _) in self.learnt.items()}
+        share, q = self._weights(learnt), self.model.hysteresis.weights
+        found = {'learnt/gain': learnt['gain']}
+        if share is not None and q.any():
+            found['learnt/loop'] = learnt['gain'] + float(q @ share / q.sum())
+        return found
+
+    def _weights(self, learnt: dict[str, float]) -> Array | None:
+        """Return the share by which each play weighs more, beside the gain."""
+        hats = [x for name, x in learnt.items() if name.startswith('weights')]
+        r = self.model.hysteresis.thresholds
+        return np.interp(r, np.linspace(r[0], r[-1], len(hats)), hats) if hats else None
+
+    @property
+    def learnt_model(self) -> StageModel:
+        """The model with what was learnt, and its history."""
+        model, changes = self.model, {name: x for name, (x, _) in self.learnt.items()}
+        gain, h = 1.0 + changes['gain'], model.hysteresis
+        share = self._weights(changes)
+        if share is not None:
+            h = _grown(h, share / gain)
+        h = h.scaled(gain)
+        h = replace(h, p1=h.p1 + changes.get('cubic', 0.0))
+        if 'creep' in changes:
+            model = _creeping(model, 1.0 + changes['creep'])
+        entry = {
+            'adapt': self.kind,
+            'seconds': round(self.seconds, 3),
+            **{name: {'value': x, 'std': std} for name, (x, std) in self.learnt.items()},
+        }
+        before = model.identification.get('adaptation') or []
+        found = {**model.identification, 'adaptation': [*before, entry]}
+        return replace(model, hysteresis=h, identification=found)
+
+    def process(
+        self, v: Array, t: Array, free: Array, measured: Array, sound: bool = True
+    ) -> Array:
+        """
+        Return the free run of the model that was learnt, for the next samples [m], shape (n,).
+
+        Parameters
+        ----------
+        v, t : ndarray, shape (n,)
+            Voltage [V] and its time [s].
+        free : ndarray, shape (n,)
+            Free run of the model as given [m].
+        measured : ndarray, shape (n,)
+            Displacement of `horizon` samples before each [m], NaN where there is none.
+        sound : bool, optional
+            Whether the free run is to be learnt from; not while plays are unknown.
+        """
+        Y, s = self.model.scaling.Y, self.model.scaling
+        new = np.stack([s.x(free), *[(run.process(v, t) - free) / Y for run in self._runs]])
+        whole = np.concatenate([self._past, new], axis=1)
+        before, self._past = whole[:, : v.size].copy(), whole[:, v.size :].copy()
+        y = s.x(measured) if sound else np.full(v.size, np.nan)
+        out = np.empty(v.size)
+        kernel.learn(
+            y,
+            before,
+            new,
+            self._law,
+            self._prior,
+            self._halves,
+            self._theta,
+            self._information,
+            self._slow,
+            self._sums,
+            self._now,
+            self._group,
+            out,
+        )
+        return np.asarray(free + Y * out)
