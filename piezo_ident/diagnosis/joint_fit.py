@@ -215,12 +215,14 @@ def fit_jointly(
         damping = max(damping * next_damping(gain / promised), LEAST_DAMPING)
         state, e, given = better, left, new
         poor = poor + 1 if gain < KEPT[0] * promised else 0
-        if poor >= POOR and more > 1 and base is old and state.law is not None:
+        may_renew = more > 1 and base is old and state.law is not None
+        is_slow = poor > 0 and may_renew
+        if poor >= POOR and may_renew:
             # what effects make of H is no longer what its columns say
             base = base_at(simulator, state)
         moving = _derivatives(simulator, state, parameters, tick)
-        # a first step tells little of those behind it
-        hopeless = done > 0 and after - _to_come(gain, last, more) > goal * e.size
+        # a first step tells little of those behind it, and so do steps with old columns
+        hopeless = done > 0 and not is_slow and after - _to_come(gain, last, more) > goal * e.size
         if hopeless or gain < least:
             break
         last = gain
