@@ -24,6 +24,7 @@ from piezo_ident.diagnosis.refits import law_of, refit_of, with_g
 from piezo_ident.diagnosis.search import Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.trial_scores import TrialColumns
 from piezo_ident.effects import Effect, find_effect
 
 #: share of what the best smaller set leaves that a candidate must promise to be fitted on
@@ -56,7 +57,8 @@ class CandidateSearch:
         tick: Tick,
     ) -> None:
         self._simulator, self._given, self._rng, self._tick = simulator, given, rng, tick
-        self._lines, self._noise, self._missed = lines, noise, missed
+        self._noise, self._missed = noise, missed
+        self._columns = TrialColumns(simulator, given, lines)
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
         # a known effect of the path that has changed since would look like another one
@@ -121,6 +123,8 @@ class CandidateSearch:
             best = candidates.of(effects)[0]
             have = {c.way for c in candidates.of(effects)}
             state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
+            # a way that leaves more than the best one does not count
+            goal = np.inf if effects == sets[0] else self._noise + candidates.left(best)
             more = []
             if 'given' not in have:
                 fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
@@ -129,12 +133,12 @@ class CandidateSearch:
                 more.append(replace(best, way='given', fitted=fitted))
             for way, law in laws.items():
                 if way not in have:
-                    fitted = refit_of(self._simulator, state, law)
+                    fitted = refit_of(self._simulator, state, law, goal)
                     more.append(replace(best, way=way, fitted=fitted))
             if self._simulator.is_fast and not change_g(effects):
                 last = min(more, key=candidates.left, default=best)
                 if not last.retunes:
-                    more.append(replace(last, fitted=with_g(self._simulator, last.fitted)))
+                    more.append(replace(last, fitted=with_g(self._simulator, last.fitted, goal)))
             candidates = candidates.and_these(more)
         return candidates
 
@@ -198,7 +202,7 @@ class CandidateSearch:
             self._simulator,
             fitted,
             effects,
-            self._lines,
+            self._columns,
             self._noise,
             self._rng,
             tick,

@@ -36,8 +36,8 @@ class NormalEquations:
     b: Array
     s: Array
 
-    def only(self, chosen: Mask) -> NormalEquations:
-        """Return those of some columns; shape (p,)."""
+    def only(self, chosen: Mask | Integers) -> NormalEquations:
+        """Return those of some columns; a mask of shape (p,), or their places."""
         return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
 
 

@@ -24,7 +24,7 @@ from piezo_ident.diagnosis.cross_validation import (
     right_sides,
     with_columns,
 )
-from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, Scale, WORSE
+from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, KEPT, next_damping, Scale, WORSE
 from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -34,6 +34,8 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
 #: first damping, a share of the energy of each column, and the least
 DAMPING, LEAST_DAMPING = 1e-4, 1e-9
+#: steps in a row that keep too little of what they promise before columns of H are made anew
+POOR = 2
 #: steps gain less and less, but as a forecast no less than this times the one before
 LEAST_RATIO = 0.5
 #: share of what shows a parameter that other kinds of excitation must hold to tell it
@@ -162,9 +164,10 @@ def fit_jointly(
     """
     Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
 
-    A step that lowers the mean square by less than `enough` is the last one, and one that promises
-    less is not made.  So is one after which the steps that are left, were they like it or falling
-    as they do, would not reach the mean square `goal` of what is fitted.  `tick` is called between
+    Where steps keep too little of what they promise, the columns of H are made anew, once.  A step
+    that lowers the mean square by less than `enough` is the last one, and one that promises less
+    is not made.  So is one after which the steps that are left, were they like it or falling as
+    they do, would not reach the mean square `goal` of what is fitted.  `tick` is called between
     the steps, and may raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives what is fitted
     besides the rows, in a state of so many free numbers.  Singular equations raise
     IdentificationError, an effect that cannot run on these data ModelError.
@@ -174,7 +177,7 @@ def fit_jointly(
     free_h = state.law is not None and pull_at is None
     parameters = free_parameters(state, len(rows.names), rows.longest if free_h else None)
     p = base.columns.shape[1] + len(parameters)
-    damping, last = DAMPING, 0.0
+    damping, last, poor, old = DAMPING, 0.0, 0, base
     e = rows.x - simulator.remember(state)
     moving = _derivatives(simulator, state, parameters, tick)
     given = pull_at and pull_at(state, p)
@@ -211,9 +214,15 @@ def fit_jointly(
         gain, more = before - after, iterations - 1 - done
         damping = max(damping * next_damping(gain / promised), LEAST_DAMPING)
         state, e, given = better, left, new
+        poor = poor + 1 if gain < KEPT[0] * promised else 0
+        may_renew = more > 1 and base is old and state.law is not None
+        is_slow = poor > 0 and may_renew
+        if poor >= POOR and may_renew:
+            # what effects make of H is no longer what its columns say
+            base = base_at(simulator, state)
         moving = _derivatives(simulator, state, parameters, tick)
-        # a first step tells little of those behind it
-        hopeless = done > 0 and after - _to_come(gain, last, more) > goal * e.size
+        # a first step tells little of those behind it, and so do steps with old columns
+        hopeless = done > 0 and not is_slow and after - _to_come(gain, last, more) > goal * e.size
         if hopeless or gain < least:
             break
         last = gain

@@ -71,18 +71,18 @@ def base_thresholds(swing: float) -> np.ndarray:
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
-def refit_of(simulator: Simulator, state: State, name: LawName) -> Fitted:
-    """Return H refitted as one of a family, effects and G as they are."""
+def refit_of(simulator: Simulator, state: State, name: LawName, goal: float = np.inf) -> Fitted:
+    """Return H refitted as one of a family, G as it is; `goal` as of `fit_jointly`."""
     low, high = simulator.rows.reach
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
-    return fit_jointly(simulator, *fit_base(simulator, state, law))
+    return fit_jointly(simulator, *fit_base(simulator, state, law), goal=goal)
 
 
-def with_g(simulator: Simulator, fitted: Fitted) -> Fitted:
-    """Return a fit with G retuned, too."""
+def with_g(simulator: Simulator, fitted: Fitted, goal: float = np.inf) -> Fitted:
+    """Return a fit with G retuned, too; `goal` as of `fit_jointly`."""
     state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
-    return fit_jointly(simulator, state, fitted.base)
+    return fit_jointly(simulator, state, fitted.base, goal=goal)
 
 
 def walk(
@@ -93,7 +93,11 @@ def walk(
     tick: Callable[[], None],
 ) -> Step:
     """Return the H of the refined model, beside the effects of the best candidate."""
-    steps = _steps(simulator, given, candidates, best, tick)
+
+    def goal() -> float:
+        return candidates.noise + TAKES * _left(candidates, last.fitted)
+
+    steps = _steps(simulator, given, candidates, best, tick, goal)
     first = last = next(steps)
     if candidates.rows.passes < PASSES:
         # a branch that was passed once has no second one to be held out
@@ -124,9 +128,15 @@ def _steps(
     candidates: Candidates,
     best: Candidate | None,
     tick: Callable[[], None],
+    goal: Callable[[], float],
 ) -> Iterator[Step]:
-    """Give one H after the other, each wider than the one before."""
-    own = candidates.of(()) if best is None else (best,)
+    """
+    Give one H after the other, each wider than the one before.
+
+    What cannot leave a mean square as small as the `goal` of the moment is not fitted on.
+    """
+    # the best of a way comes last
+    own = candidates.of(() if best is None else best.effects)[::-1]
     known = {c.way: c.fitted for c in own if not c.retunes}
     retuned = {c.way: c.fitted for c in own if c.retunes}
     state = candidates.as_given.fitted.state
@@ -134,13 +144,14 @@ def _steps(
         state = state.with_effects_of(best.fitted.state)
     first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
     yield Step('given', first)
-    yield Step('plays', known.get('plays') or refit_of(simulator, first.state, 'plays'))
+    plays = known.get('plays') or refit_of(simulator, first.state, 'plays', goal())
+    yield Step('plays', plays)
     yield from (Step(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
     of_law = {law_of(known['wide']): known['wide']} if 'wide' in known else {}
 
-    def wide_of(name: LawName) -> Fitted:
+    def wide_of(name: LawName, goal: float = np.inf) -> Fitted:
         if name not in of_law:
-            of_law[name] = refit_of(simulator, first.state, name)
+            of_law[name] = refit_of(simulator, first.state, name, goal)
         return of_law[name]
 
     laws = WIDE
@@ -152,7 +163,7 @@ def _steps(
         if drawn is not wide:
             yield Step('drawn', drawn)
         laws = WIDE[:1]
-    wides = [wide_of(name) for name in laws]
+    wides = [wide_of(name, goal()) for name in laws]
     yield from (Step('wide', wide) for wide in wides)
     # a change of G that was found is all that there is of it
     wide = min(wides, key=partial(_left, candidates))

@@ -27,7 +27,14 @@ from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
-from piezo_ident.diagnosis.trial_scores import best_trials, score_trials, Scored, started, Tick
+from piezo_ident.diagnosis.trial_scores import (
+    best_trials,
+    score_trials,
+    Scored,
+    started,
+    Tick,
+    TrialColumns,
+)
 from piezo_ident.effects import Effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
@@ -86,7 +93,7 @@ def search_round(
     simulator: Simulator,
     before: Fitted,
     effects: Sequence[type[Effect]],
-    lines: Sequence[float],
+    columns: TrialColumns,
     noise: float,
     rng: np.random.Generator,
     tick: Tick,
@@ -96,9 +103,8 @@ def search_round(
     """
     Score all candidates and fit the best of them jointly.
 
-    `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row, and
-    `rng` draws the shifts of the surrogates.  What does not promise to reach the mean square
-    `goal` is not fitted on.
+    `noise` is the mean square of the noise of a row, and `rng` draws the shifts of the surrogates.
+    What does not promise to reach the mean square `goal` is not fitted on.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
@@ -110,7 +116,7 @@ def search_round(
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
     for scored in score_trials(
-        simulator, before, effects, lines, surrogates, lambda share: tick(0.5 * share)
+        columns, before, effects, surrogates, lambda share: tick(0.5 * share)
     ):
         name = scored.effect.name
         visible[name] = max(visible.get(name, 0.0), scored.visible)
@@ -136,7 +142,7 @@ def search_round(
         )
         for scores in chosen
     ]
-    _add_plain_starts(simulator, before, starts, lines)
+    _add_plain_starts(simulator, before, starts, columns)
     contenders, warnings = _contenders(simulator, before, starts, noise, goal, tick)
     tick(1.0)
     return Round(
@@ -153,7 +159,7 @@ def _add_plain_starts(
     simulator: Simulator,
     before: Fitted,
     starts: Sequence[tuple[type[Effect], list[State]]],
-    lines: Sequence[float],
+    columns: TrialColumns,
 ) -> None:
     """
     Add the best start of each effect beside a sum of plays, as an H of the wide law.
@@ -169,7 +175,7 @@ def _add_plain_starts(
     enough = WORTH_FIT * before.mean_square
     plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), enough=enough)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
-    best = best_trials(simulator, plain, [effect for effect, _ in starts], lines)
+    best = best_trials(columns, plain, [effect for effect, _ in starts])
     most = PLAIN_START * float(before.errors.sum())
     for effect, states in starts:
         one = best.get(effect.name)

@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from piezo_ident.common.arrays import Array
+from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.diagnosis.cross_validation import (
     held_out_errors,
     normal_equations,
@@ -25,7 +27,7 @@ from piezo_ident.diagnosis.cross_validation import (
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import Added
+from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
@@ -72,88 +74,107 @@ class Scored:
         return float(self.errors.sum())
 
 
+class TrialColumns:
+    """
+    What trials add to the rows of one state, computed once.
+
+    An effect that is only slightly on adds the same beside another H or another effect, but for
+    their small differences.  So every search of some data scores the same columns.
+    """
+
+    def __init__(self, simulator: Simulator, state: State, lines: Sequence[float]) -> None:
+        self.rows = simulator.rows
+        self._simulator, self._state = simulator, state
+        self._view = _view_of(simulator, lines)
+        #: of an effect, its trials that can run, with the places of their settings, and what each
+        #: setting adds, in half of the room
+        self._kept: dict[str, tuple[list[tuple[Trial, list[int]]], NDArray[np.float32]]] = {}
+
+    def of(
+        self, effect: type[Effect], tick: Callable[[], None]
+    ) -> tuple[list[tuple[Trial, Integers]], Array]:
+        """
+        Return the trials of an effect with the places of their columns, and all columns.
+
+        Shape (n, c), a column for a step of each amplitude, and of an effect that is driven by
+        time one for each record.  A trial that cannot run on these data is left out.
+        """
+        if effect.name not in self._kept:
+            self._kept[effect.name] = self._run(effect, tick)
+        trials, added = self._kept[effect.name]
+        count = len(self.rows.names) if effect.time_driven else 1
+        records = np.arange(count)
+        own = [(one, np.add.outer(count * np.array(at), records).ravel()) for one, at in trials]
+        if count > 1:
+            is_own = self.rows.of_record == records[:, None]
+            added = (added[:, None] * is_own).reshape(-1, self.rows.n)
+        return own, added.T.astype(np.float64)
+
+    def _run(
+        self, effect: type[Effect], tick: Callable[[], None]
+    ) -> tuple[list[tuple[Trial, list[int]]], NDArray[np.float32]]:
+        rows = self.rows
+        known: dict[tuple[bytes, ...], int | None] = {}
+        found, trials = list[Array](), list[tuple[Trial, list[int]]]()
+        for trial in effect.trials(self._view):
+            tick()
+            self._simulator.remember(self._state)
+            settings = trial.settings()
+            keys = [tuple(np.asarray(x).tobytes() for x in one.values()) for one in settings]
+            new = {k: one for k, one in zip(keys, settings, strict=True) if k not in known}
+            added = [Added(effect.name, (one,) * len(rows.names)) for one in new.values()]
+            for key, column in zip(new, self._simulator.added(added), strict=True):
+                known[key] = None
+                if column is not None and np.all(np.isfinite(column)):
+                    known[key] = len(found)
+                    found.append(column.astype(np.float32))
+            places = [place for place in map(known.get, keys) if place is not None]
+            if len(places) == len(keys) and any(found[place].any() for place in places):
+                trials.append((trial, places))
+        return trials, np.array(found, np.float32).reshape(len(found), rows.n)
+
+
 def score_trials(
-    simulator: Simulator,
+    columns: TrialColumns,
     fitted: Fitted,
     effects: Sequence[type[Effect]],
-    lines: Sequence[float],
     surrogates: Array,
     tick: Tick = lambda share: None,
 ) -> Iterator[Scored]:
     """Score every trial of every effect on the residual of a fit; surrogates, shape (n, k)."""
-    rows = simulator.rows
-    simulator.remember(fitted.state)
-    M, prior = fitted.J, fitted.prior[fitted.free]
-    E = np.column_stack([fitted.e, surrogates])
-    equations = normal_equations(rows, M, E)
-    alone = held_out_errors(equations, rows.fold, prior).sum(axis=0)
-    view = _view_of(simulator, lines)
-    trials = [(effect, trial) for effect in effects for trial in effect.trials(view)]
-    columns = _Columns(simulator)
-    for done, (effect, trial) in enumerate(trials):
-        tick(done / len(trials))
-        C = columns.of(effect, trial)
-        if C is None or not np.all(np.isfinite(C)) or not np.any(C):
-            continue
-        both = with_columns(rows, equations, M, C, E)
-        wide = np.concatenate([prior, np.zeros(C.shape[1])])
-        theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[M.shape[1] :]
-        visible = _visible(both, M.shape[1], wide)
-        if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
-            yield Scored(effect, trial, theta, equations.s[:, 0], 0.0, visible, False)
-            continue
-        errors = held_out_errors(both, rows.fold, wide)
-        chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
-        yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
+    rows, M, prior = columns.rows, fitted.J, fitted.prior[fitted.free]
+    E, p = np.column_stack([fitted.e, surrogates]), M.shape[1]
+    known = normal_equations(rows, M, E)
+    alone = held_out_errors(known, rows.fold, prior).sum(axis=0)
+    for done, effect in enumerate(effects):
+        at = partial(tick, done / len(effects))
+        trials, C = columns.of(effect, at)
+        whole = with_columns(rows, known, M, C, E)
+        for trial, places in trials:
+            at()
+            both = whole.only(np.concatenate([np.arange(p), p + places]))
+            wide = np.concatenate([prior, np.zeros(places.size)])
+            theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[p:]
+            visible = _visible(both, p, wide)
+            if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
+                yield Scored(effect, trial, theta, known.s[:, 0], 0.0, visible, False)
+                continue
+            errors = held_out_errors(both, rows.fold, wide)
+            chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
+            yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
 
 
 def best_trials(
-    simulator: Simulator, fitted: Fitted, effects: Sequence[type[Effect]], lines: Sequence[float]
+    columns: TrialColumns, fitted: Fitted, effects: Sequence[type[Effect]]
 ) -> dict[str, Scored]:
     """Return the best possible trial of every effect that has one, on the residual of a fit."""
     best: dict[str, Scored] = {}
-    none = np.zeros((simulator.rows.n, 0))
-    for scored in score_trials(simulator, fitted, effects, lines, none):
+    none = np.zeros((columns.rows.n, 0))
+    for scored in score_trials(columns, fitted, effects, none):
         name = scored.effect.name
         if scored.is_possible and (name not in best or scored.error < best[name].error):
             best[name] = scored
     return best
-
-
-class _Columns:
-    """Columns of trials; those of the effect at hand are kept, since its trials share some."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
-        self._effect: type[Effect] | None = None
-        self._kept: dict[tuple[bytes, ...], Array | None] = {}
-
-    def of(self, effect: type[Effect], trial: Trial) -> Array | None:
-        """
-        Return what an effect would add to the rows for a step of each of its amplitudes.
-
-        Shape (n, c): for an effect that is driven by time, a column for each record and amplitude.
-        None where it cannot run on these data.
-        """
-        rows = self._simulator.rows
-        count = len(rows.names)
-        if effect is not self._effect:
-            self._effect, self._kept = effect, {}
-        settings = trial.settings()
-        keys = [tuple(np.asarray(x).tobytes() for x in setting.values()) for setting in settings]
-        new = {k: s for k, s in zip(keys, settings, strict=True) if k not in self._kept}
-        added = [Added(effect.name, (setting,) * count) for setting in new.values()]
-        self._kept |= dict(zip(new, self._simulator.added(added), strict=True))
-        columns = []
-        for key in keys:
-            column = self._kept[key]
-            if column is None:
-                return None
-            if effect.time_driven:
-                columns += [np.where(rows.of_record == k, column, 0.0) for k in range(count)]
-            else:
-                columns.append(column)
-        return np.array(columns).T
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
