@@ -12,7 +12,7 @@ import sys
 from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.records import check_bag_options, expand, options_of
+from piezo_ident.cli.files import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import DiagnosisSettings

@@ -10,8 +10,17 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
-from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all, spans
+from piezo_ident.cli.files import (
+    BAG_FILES,
+    check_apart,
+    check_file,
+    check_link,
+    check_suffix,
+    data_of,
+    print_faults,
+    read_all,
+    spans,
+)
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text

@@ -21,7 +21,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident import __version__
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.records import expand
+from piezo_ident.cli.files import expand
 from piezo_ident.common.config import find_config, shipped_names
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.excitation.program import Program
@@ -48,7 +48,7 @@ def test_version_and_help(capsys):
         # before the arguments are known
         ('', ('numpy', 'scipy', 'numba', 'matplotlib')),
         ('effects', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'rosbags', 'matplotlib')),
-        ('predict', ('scipy.signal', 'scipy.stats', 'matplotlib', 'jinja2')),
+        ('model', ('scipy.signal', 'scipy.stats', 'matplotlib', 'jinja2')),
         ('record', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'matplotlib')),
     ],
 )

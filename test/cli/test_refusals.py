@@ -132,7 +132,7 @@ def test_what_cannot_work(capsys, tmp_path, made, monkeypatch, case):
     if case in OUTPUTS:
         for work in (
             'identify_command.identify',
-            'predict_command.free_run',
+            'model_command.free_run',
             'record_command.SimulatedStage',
         ):
             monkeypatch.delattr(f'piezo_ident.cli.{work}')

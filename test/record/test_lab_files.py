@@ -13,9 +13,9 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main
 from piezo_ident.cli.console import Console
+from piezo_ident.cli.files import read_all, spans
 from piezo_ident.cli.identify_command import prompt_of
 from piezo_ident.cli.main import cli
-from piezo_ident.cli.records import read_all, spans
 from piezo_ident.common.errors import DataError
 import pytest
 import scipy.io
