@@ -34,7 +34,7 @@ from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.tables import blocks_of
+from piezo_ident.record.tables.write import blocks_of
 
 SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 

@@ -31,7 +31,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.tables import labels_of
+from piezo_ident.record.tables.write import labels_of
 
 PROGRAM_FILES = ('.yaml', '.yml')
 

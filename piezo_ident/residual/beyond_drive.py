@@ -88,23 +88,25 @@ def _slow(n: int) -> Array:
 
 
 def _solve(A: Array, e: Array) -> Array:
-    """Return the least squares of scaled columns, directions that are rounding left out."""
-    N = A.T @ A
-    scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
-    values, vectors = linalg.eigh(N / scale / scale[:, None])
-    kept = values > RANK**1.5 * values[-1]
-    part = vectors[:, kept]
-    return np.asarray(part @ ((part.T @ (A.T @ e / scale)) / values[kept]) / scale)
+    """Return the least squares of columns (n, k), directions that are rounding left out."""
+    scale, values, vectors = _directions(A, RANK**1.5)
+    return np.asarray(vectors @ ((vectors.T @ (A.T @ e / scale)) / values) / scale)
 
 
 def _basis(A: Array, rank: float) -> tuple[Array, Array]:
     """Return an orthonormal basis of columns (n, k), and the combinations that make it."""
+    scale, values, vectors = _directions(A, rank)
+    made = vectors / np.sqrt(values) / scale[:, None]
+    return A @ made, made
+
+
+def _directions(A: Array, rank: float) -> tuple[Array, Array, Array]:
+    """Return the sizes of columns, and what their products have above a share of the largest."""
     N = A.T @ A
     scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
     values, vectors = linalg.eigh(N / scale / scale[:, None])
     kept = values > rank * max(float(values[-1]), 1e-300)
-    made = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
-    return A @ made, made
+    return scale, values[kept], vectors[:, kept]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
-from piezo_ident.record.faults import quantum_of, white_noise
+from piezo_ident.record.faults import end_of_rest, MOVED, quantum_of, STUCK, white_noise
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
@@ -82,6 +82,10 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
 
 def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> list[Fault]:
     action = 'left in, as they are the way of the data' if many else 'left out'
+    told = {
+        'outliers': (outliers, f'isolated jumps; {action}'),
+        'clipping': (clipped, 'at the end of their range while the model moves; left out'),
+    }
     return [
         Fault(
             name,
@@ -89,14 +93,7 @@ def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> li
             int(mask.sum()),
             what,
         )
-        for name, mask, what in (
-            ('outliers', outliers, f'isolated jumps; {action}'),
-            (
-                'clipping',
-                clipped,
-                'readings at the end of their range while the model moves; left out',
-            ),
-        )
+        for name, (mask, what) in told.items()
         if mask.any()
     ]
 
@@ -203,11 +200,10 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
         for a, b in true_runs(at):
             if b - a < FLAT:
                 continue
-            # a delay lets the end of a rest look as if v moved on
-            late = b - min((b - a) // 4, round(0.002 * part.piece.sample_rate))
+            late = end_of_rest(part.piece, a, b)
             moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
             gone = moved > LEFT * (noise.rms + noise.quantum) and moved > 1e-4 * stroke
-            if drive > 1e-4 * span and (gone or (drive > 0.02 * span and b - a >= 4 * FLAT)):
+            if drive > 1e-4 * span and (gone or (drive > MOVED * span and b - a >= STUCK)):
                 # what reads the same elsewhere has been cut off there too
                 found |= at
                 break

@@ -112,7 +112,7 @@ def test_no_right_to_read(tmp_path, record, monkeypatch, capsys):
 
 def test_more_than_a_file_may_hold(tmp_path, record, monkeypatch):
     pi.write(record, tmp_path / 'r.npz')
-    monkeypatch.setattr('piezo_ident.record.arrays.UNPACKED_SIZE', 1000)
+    monkeypatch.setattr('piezo_ident.record.tables.arrays.UNPACKED_SIZE', 1000)
     refused(lambda: pi.read(tmp_path / 'r.npz'), 'unpacks to more', kind=DataError)
     assert files.UNPACKED_SIZE > 2**32
 
