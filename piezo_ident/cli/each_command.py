@@ -129,7 +129,7 @@ def _told(row: Row) -> tuple[str, str]:
 def _print(
     rows: Sequence[Row], bad: Sequence[Row], console: Console
 ) -> dict[str, dict[str, float]]:
-    """Print what came out, and return what stands out."""
+    """Print a summary of all records, and return those that stand out."""
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
         console.say(f'  {row.record}: {row.reason}')

@@ -179,7 +179,7 @@ def spans(records: Sequence[Record]) -> str:
     ends = [end for record in records for end in record.voltage_range]
     parts = []
     for name, unit, x in (('stroke', 'um', strokes), ('voltage', 'V', ends)):
-        # of one that is not recorded nothing is known
+        # a displacement or voltage that was not recorded is NaN
         if all(map(math.isfinite, x)):
             both = dict.fromkeys(f'{end:.4g}' for end in (min(x), max(x)))
             parts.append(f'{name} {" to ".join(both)} {unit}')
@@ -187,7 +187,7 @@ def spans(records: Sequence[Record]) -> str:
 
 
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
-    """Print the faults of a record, and what the file it was written to cannot keep."""
+    """Print the faults of a record, and the losses of the file that it was written to."""
     for fault in record.faults:
         if fault.name not in SHOWN:
             console.say(f'met: {fault}')
@@ -196,7 +196,7 @@ def print_faults(record: Record, losses: Sequence[str], console: Console) -> Non
 
 
 def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
-    """Return what a record holds, its faults, and what its file cannot keep."""
+    """Return the size of a record, its faults, and the losses of its file, for programs."""
     return {
         'record': record.name,
         'pieces': len(record.pieces),
@@ -273,7 +273,7 @@ def check_folder(path: Path) -> None:
 
 
 def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
-    """Refuse to write a result over what it is made of."""
+    """Refuse to write a result over one of its inputs."""
     if output.exists() and any(p.exists() and output.samefile(p) for p in inputs):
         raise DataError(f'{output}: is one of the inputs; choose another name')
 

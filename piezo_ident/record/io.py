@@ -74,7 +74,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     Returns
     -------
     Record
-        In SI units; its `faults` say what was wrong with the data and what was done about it.
+        In SI units; its `faults` name every fault of the data, and how it was met.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def write(
     Parameters
     ----------
     record : Record
-        What to write; its faults are no part of any file.
+        No file keeps its faults.
     path : path
         Where to; nothing is left there when writing fails.
     overwrite : bool

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a residual holds that no function of the drive makes, and whether a channel makes it."""
+"""Tests of further channels as a cause of a residual that no function of the drive explains."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WHITE, LEVEL = 32, 0.1
 SIGNIFICANT = 1e-5
 #: share of the gain that must be left where it was not fitted, and parts held out in turn
 KEPT, FOLDS = 0.5, 5
-#: share of a record around no shift that is no surrogate
+#: shifts by less than this share of a record are not used as surrogates
 AROUND = 0.05
 
 
@@ -130,10 +130,10 @@ def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
     """
     Return for every further channel of records what it explains that the drive cannot.
 
-    Residual and channel are freed of functions of the drive (`drive_functions`), weighted by the
-    level of the residual around, so that what is still counts, and made white.  Then the channel
-    with its plays and low-passes explains what it explains, and circular shifts of the residual
-    say what an unrelated one would.
+    Functions of the drive (`drive_functions`) are subtracted from residual and channel.  Both are
+    divided by the level of the residual nearby, so that quiet stretches count, and made white.
+    The channel, its plays and its low-passes then explain a share of the residual.  Circular
+    shifts of the residual tell the share that an unrelated channel explains.
 
     Notes
     -----
@@ -156,7 +156,7 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     if not moves or _follows(having, name, found):
         return ChannelTest(name)
     levels = [_level(p) for p in found]
-    # what the channel adds is not made white: of a single tone nothing would be left
+    # only the rest is made white: whitening would remove a channel that is a single tone
     at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(found, levels, strict=True)]
     white = _whitening(np.concatenate(at_level))
     weighed = list(zip(found, levels, strict=True))
@@ -183,7 +183,7 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
 def without_channels(
     parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
 ) -> list[ResidualPart]:
-    """Return parts without what significant channels add, so that their lines are not hum."""
+    """Subtract what significant channels add, so that lines of a channel do not pass for hum."""
     # the voltage and the displacement of one axis tell the same, and each was tested alone
     of_axis: dict[str, list[list[ResidualPart]]] = {}
     for t in tests:

@@ -53,7 +53,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     """
     Look for outliers, clipping, coarse steps, jitter and knocks: one fault for each part and kind.
 
-    What the readings alone show is left out before, by `piezo_ident.record.faults`.
+    `piezo_ident.record.faults` has left out the faults that the readings alone show.
     """
     faults: list[Fault] = []
     found: list[Mask] = []
@@ -215,9 +215,9 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     Return the rms scatter of the sampling instants [s], and by how much the variance grows.
 
     A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
-    sigma^2 + jitter^2 (dy/dt)^2.  Third differences keep what a model misses out of it, where
-    the motion is smooth; what is left of it grows with the motion's own third differences, which
-    are a second cause, and where they are large nothing is read.
+    sigma^2 + jitter^2 (dy/dt)^2.  Third differences remove the error of the model where the motion
+    is smooth.  The rest of that error grows with the third differences of the motion: they are the
+    second cause in the regression, and blocks where they are large are not used.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)
@@ -246,7 +246,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     slope2, error = _slope(s2, motion2, h2)
     if slope2 <= SURE * error:
         return 0.0, 1.0
-    # what a model misses is smooth; jitter is another from sample to sample
+    # the error of a model is smooth; jitter changes from sample to sample
     anticorrelated = float(np.mean(neighbours)) < 0.0
     apart = _slope(s2, motion2, -neighbours)[0] / slope2 if anticorrelated else 0.0
     if not WHITE[0] < apart < WHITE[1]:
@@ -257,7 +257,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
         # steps of a converter scatter with the speed as well
         return 0.0, 1.0
     growth = 1.0 + slope2 * float(np.quantile(s2, 0.98)) / base
-    # what saturates with speed, as a converter's own noise does, is no jitter
+    # the noise of a converter saturates with speed, jitter does not
     fast = s2 > np.median(s2)
     again, error = _slope(s2[fast], motion2[fast], h2[fast])
     if growth < GROWTH or again <= 3.0 * error or not 0.3 < again / slope2 < 3.0:

@@ -183,7 +183,7 @@ def _sidecars(file: Path) -> list[Path]:
 
 
 class _Part(NamedTuple):
-    """What one file holds, and what is wrong with it."""
+    """Contents and damage of one file."""
 
     connections: list[Connection]
     messages: Callable[[], Iterator[Stored]]
