@@ -23,8 +23,8 @@ def deferred_interrupts() -> Iterator[Callable[..., None]]:
     """
     Have Ctrl-C wait until all outputs of a command are whole.
 
-    What is yielded takes any arguments, and raises KeyboardInterrupt when one is waiting; for long
-    work before the first output is in its place.
+    The function that is yielded raises KeyboardInterrupt when an interrupt is waiting, and takes
+    any arguments: long work before the first output calls it.
     """
     waiting: list[int] = []
 
@@ -98,7 +98,7 @@ class Console:
                     total=1.0,
                     desc=f'{step:12s}',
                     bar_format='{desc} {percentage:3.0f}% |{bar}| {elapsed}',
-                    # a terminal that does not tell its size would get no bar at all
+                    # a terminal may not tell its size
                     ncols=min(80, size.columns),
                     nrows=size.lines,
                     leave=False,

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from piezo_ident.cli.console import Console
 from piezo_ident.cli.each_command import check_each, diagnose_each
 from piezo_ident.cli.effects_command import effect_names
+from piezo_ident.cli.files import check_order, fields_of
 from piezo_ident.cli.identify_command import (
     checked,
     keep,
@@ -20,7 +21,6 @@ from piezo_ident.cli.identify_command import (
     prompt_of,
     read_both,
 )
-from piezo_ident.cli.records import check_order, fields_of
 from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue

@@ -12,7 +12,7 @@ import sys
 from types import SimpleNamespace
 
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.records import check_bag_options, expand, options_of
+from piezo_ident.cli.files import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import DiagnosisSettings
@@ -129,7 +129,7 @@ def _told(row: Row) -> tuple[str, str]:
 def _print(
     rows: Sequence[Row], bad: Sequence[Row], console: Console
 ) -> dict[str, dict[str, float]]:
-    """Print what came out, and return what stands out."""
+    """Print a summary of all records, and return those that stand out."""
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
         console.say(f'  {row.record}: {row.reason}')

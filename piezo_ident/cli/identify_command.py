@@ -16,10 +16,18 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.each_command import check_each, identify_each
+from piezo_ident.cli.files import (
+    check_distinct,
+    check_file,
+    check_folder,
+    check_suffix,
+    expand_apart,
+    fields_of,
+    MODEL_FILES,
+    read_all,
+)
+from piezo_ident.cli.model_command import print_run
 from piezo_ident.cli.options import READING
-from piezo_ident.cli.outputs import check_distinct, check_file, check_folder, check_suffix
-from piezo_ident.cli.predict_command import print_run
-from piezo_ident.cli.records import expand_apart, fields_of, MODEL_FILES, read_all
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.model.multi_axis import EachAxis

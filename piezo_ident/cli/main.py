@@ -29,6 +29,11 @@ from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import PiezoIdentError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+#: verbs that share a module, which is called by its own name otherwise
+HOMES = {
+    **dict.fromkeys(('convert', 'simulate'), 'record'),
+    **dict.fromkeys(('predict', 'invert', 'export'), 'model'),
+}
 SETTINGS = {'help_option_names': ['-h', '--help']}
 
 RECORD_HELP = 'RECORD is a file, a bag, or a folder of records.'
@@ -254,7 +259,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
                 os.environ.setdefault(name, '1')
         # a verb imports only what it needs
-        home = 'record' if given.verb in ('convert', 'simulate') else given.verb
+        home = HOMES.get(given.verb, given.verb)
         module = importlib.import_module(f'piezo_ident.cli.{home}_command')
         console = Console(given.json)
         with console.notices():

@@ -75,7 +75,7 @@ def _limits(ctx: Any, param: Any, limits: tuple[float, float] | None) -> Any:
 
 
 def _among(known: Callable[[], Iterable[str]]) -> dict[str, Any]:
-    """Return what completes a name: from those that there are, or else from files."""
+    """Return the completion of a name: from the known names, or else from files."""
 
     def complete(ctx: Any, param: Any, start: str) -> list[CompletionItem]:
         names = [CompletionItem(x) for x in known() if x.startswith(start)]

@@ -10,8 +10,17 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
-from piezo_ident.cli.outputs import check_apart, check_file, check_link, check_suffix
-from piezo_ident.cli.records import BAG_FILES, data_of, print_faults, read_all, spans
+from piezo_ident.cli.files import (
+    BAG_FILES,
+    check_apart,
+    check_file,
+    check_link,
+    check_suffix,
+    data_of,
+    print_faults,
+    read_all,
+    spans,
+)
 from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
@@ -22,7 +31,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.record import io as record_io
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.tables import labels_of
+from piezo_ident.record.tables.write import labels_of
 
 PROGRAM_FILES = ('.yaml', '.yml')
 

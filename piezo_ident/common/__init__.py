@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What has nothing to do with stages: errors, compiled kernels, files, configuration."""
+"""Errors, compiled kernels, files and configuration, of use without any stage."""

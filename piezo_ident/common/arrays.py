@@ -55,7 +55,7 @@ def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
     """
     Return numbers with straight lines between usable good ones in place of the bad ones.
 
-    Where none are bad, or none good, they are returned as they are.
+    The same array comes back where no number is bad, or no number good.
 
     >>> interpolated(np.array([0.0, 9.0, 2.0]), np.array([False, True, False]))
     array([0., 1., 2.])
@@ -72,9 +72,9 @@ def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
     Return the smallest and largest of measured numbers, but for wild ones.
 
-    What three samples in a row reach belongs to the range; one or two alone may leave it by a
-    quarter of its width and four times the usual step from sample to sample, and are left out
-    beyond.  So the range of sound data, noise included, is that from minimum to maximum.  The
+    Three samples in a row span the range.  One or two samples alone may leave the range by a
+    quarter of its width and four times the usual step from sample to sample; beyond that they are
+    left out.  So the range of sound data, noise included, is that from minimum to maximum.  The
     parts are samples in the order in which they were taken; without any samples both ends are
     zero.
 

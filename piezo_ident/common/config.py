@@ -21,7 +21,7 @@ _SOURCE = Path(__file__).resolve().parents[2] / 'config'
 
 def _folders() -> Iterator[Path]:
     """Yield where the files may be: a ROS workspace, an environment, the source tree."""
-    # what ament_index_python would do, without needing it
+    # as ament_index_python does
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if prefix:
             yield Path(prefix) / _SHARE
@@ -44,8 +44,8 @@ def find_config(name: str | os.PathLike[str], kind: str) -> Path:
     Return the file that a name or a path of a program or a stage, the `kind`, stands for.
 
     ``identification`` is the shipped ``program_identification.yaml``.  A path is taken as it is;
-    where nothing stands there, the shipped file of the same name is.  Where there is no such file,
-    ConfigError names those that there are.
+    where nothing stands there, the shipped file of the same name is.  Otherwise a
+    ConfigError names the shipped files.
     """
     path = Path(name)
     plain = path.suffix == '' and path.name == str(name)

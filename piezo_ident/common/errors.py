@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The package's own exceptions: each message says what is wrong, where, and what to do."""
+"""Exceptions of the package: each message names the fault, its place, and its cure."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,10 +4,10 @@
 """
 Raw columns to a record: every fault of measured data is met here, the same way for all formats.
 
-What can be met without guessing is met and reported as a `Fault`: gaps, restarts and changes of
-the sampling rate split the record, repeated rows are dropped, samples without a number are cut
-out, but for their voltage where only the displacement has none.  What would need a guess is
-refused, and the message says what to do.
+Gaps, restarts and changes of the sampling rate split the record.  Repeated rows are dropped.
+Samples without a number are cut out; where only the displacement has none, the voltage stays.
+Each of these is reported as a `Fault`.  Data that would need a guess are refused, and the message
+says what to do.
 """
 
 from __future__ import annotations

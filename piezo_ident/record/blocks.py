@@ -33,8 +33,8 @@ BLOCK_SIZE = 100
 HELD, RAMPED = 'hold:gap', 'ramp:silence'
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5
-#: shortest sampling period of a block [s], that of 10 MHz, the highest rate of a node; and how far
-#: from zero its clock may be [s], 300 years, where a double still tells 2 us
+#: shortest sampling period of a block [s]: 10 MHz is the highest rate of a node; largest time [s]:
+#: 300 years, where a double still resolves 2 us
 SHORTEST, LATEST = 1e-7, 1e10
 #: a longest step of so many shortest ones is that of a sample that is missing, not jitter (taste)
 UNEVEN = 1.5
@@ -86,7 +86,7 @@ def encode(samples: Samples) -> tuple[Array, tuple[Dimension, Dimension]]:
 
 
 def quantity_of(dims: Sequence[Any]) -> str | None:
-    """Return what a layout says it carries, or None for a layout that is none of ours."""
+    """Return the quantity that a layout names, None for the layout of another message."""
     if len(dims) != 2 or not dims[1].label.startswith('t,'):
         return None
     return str(dims[1].label)[2:].strip()

@@ -93,7 +93,7 @@ def channel_of_quantity(quantity: str) -> str:
 
 def applied_key(quantity: str) -> str:
     """
-    Return the topic with what the amplifier made of a voltage, empty for what is no voltage.
+    Return the topic with the output of the amplifier for a voltage, empty for other quantities.
 
     >>> [applied_key(x) for x in ('voltage', 'voltage_b', 'displacement', 'x_heat')]
     ['applied_voltage', 'applied_voltage_b', '', '']

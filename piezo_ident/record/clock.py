@@ -9,6 +9,10 @@ last bit.  So a stamp is an interval, and a stretch of stamps is uniform when on
 through all its intervals.  Among the rates that do, the one with the fewest digits is taken: a
 sampling clock is 5000 Hz, not 4999.9999999997 Hz, and the choice stays the same when the record
 is written and read again.
+
+A computer that stamps samples as they arrive is late by a little here and there.  Steps between
+neighbours then look like gaps and changes of rate, but the next step takes each of them back: the
+stamps scatter about one clock.  A lost sample is not taken back.
 """
 
 from __future__ import annotations
@@ -19,8 +23,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array, Mask
-from piezo_ident.record.scatter import residual_of, scatters, without_scatter
+from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 
 #: rows looked at together, so that temporaries stay small beside a long record
 _CHUNK = 1 << 20
@@ -30,6 +33,10 @@ JUMP_BACK = 1000
 _SHORT = 8
 #: deviation from the uniform grid, in samples, that is not worth a notice
 _NEGLIGIBLE = 0.01
+#: fewer stamps tell no scatter from a change
+_LEAST = 16
+#: steps on either side over which time is averaged, so that scatter goes and a lost sample stays
+_AROUND = 8
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def split_uniform(t: Array, resolution: Resolution) -> list[tuple[int, int]]:
 
     Returns (start, stop) of each stretch in order; a stretch may be a single sample.
     """
-    cuts = without_scatter(t, np.flatnonzero(_breaks(t)) + 1)
+    cuts = _without_scatter(t, np.flatnonzero(_breaks(t)) + 1)
     bounds = [0, *cuts.tolist(), t.size]
     todo = list(itertools.pairwise(bounds))[::-1]
     if cuts.size > t.size // _SHORT + 10:
@@ -187,13 +194,13 @@ def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
     dt = (t[-1] - t[0]) / (n - 1)
     # rounding to a few decimals can hide a missing sample from a look at neighbours only
     wide = _wide(t, 1.5 * dt)
-    if wide and not scatters(t):
+    if wide and not _scatters(t):
         return wide
     low, high = rate_bounds(t, _rounding(resolution, dt))
     if low <= high:
         return []
-    residual = residual_of(t)
-    if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT or scatters(t):
+    residual = _residual_of(t)
+    if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT or _scatters(t):
         return []
     # a change of rate is a kink, a jump of the clock a step: both peak where the cut belongs
     step = np.diff(t)
@@ -203,9 +210,73 @@ def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
     if not _SHORT <= k <= n - _SHORT:
         return []
     rms = float(np.std(residual))
-    parts = sorted(float(np.std(residual_of(part))) for part in (t[:k], t[k:]))
+    parts = sorted(float(np.std(_residual_of(part))) for part in (t[:k], t[k:]))
     # behind a true cut one side at least is clean; jitter does not get smaller by cutting
     return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
+
+
+def _residual_of(t: Array) -> Array:
+    """Return what a least-squares line leaves of the stamps [s]."""
+    k = np.arange(t.size) - 0.5 * (t.size - 1)
+    x = t - t[0]
+    x -= x.mean()
+    residual: Array = x - k * (np.dot(k, x) / np.dot(k, k))
+    return residual
+
+
+def _scatters(t: Array) -> bool:
+    """
+    Return whether increasing stamps [s] scatter about one uniform clock.
+
+    They do where a line is off by less than half a sample everywhere, neighbours stray on their
+    own, and what jumps forward comes back.
+
+    >>> t = np.arange(100.0)
+    >>> _scatters(t + 0.3 * np.sin(t**2)), _scatters(np.delete(t, 50))
+    (True, False)
+    """
+    if t.size < _LEAST:
+        return False
+    residual = _residual_of(t)
+    if 2 * np.abs(residual).max() >= (t[-1] - t[0]) / (t.size - 1):
+        return False
+    step = np.diff(residual)
+    # white noise has twice its power in its steps, a change of rate next to none
+    is_white = np.dot(step, step) > np.dot(residual, residual)
+    return bool(is_white and -step.min() > 0.6 * step.max())
+
+
+def _without_scatter(t: Array, cuts: Integers) -> Integers:
+    """
+    Return where to cut increasing stamps [s] when steps that scatter are no breaks.
+
+    `cuts` are the first samples behind breaks, as steps between neighbours tell them.
+    """
+    if not cuts.size:
+        return cuts
+    marks = np.array([0, *_jumps(t), t.size], dtype=np.int64)
+    inside = np.searchsorted(cuts, marks[:-1], 'right') < np.searchsorted(cuts, marks[1:])
+    for i in np.flatnonzero(inside & (np.diff(marks) >= _LEAST)):
+        start, stop = marks[i], marks[i + 1]
+        if _scatters(t[start:stop]):
+            cuts = cuts[(cuts <= start) | (cuts >= stop)]
+            cuts = np.union1d(cuts, marks[i : i + 2])
+    return cuts[(cuts > 0) & (cuts < t.size)]
+
+
+def _jumps(t: Array) -> Iterator[int]:
+    """Yield the samples before which time jumps by more than half a step, and stays there."""
+    dt = float(np.median(np.diff(t[:_CHUNK])))
+    # mean time behind a sample less that before it, in terms of the steps between
+    weights = 1 - np.abs(np.arange(1 - _AROUND, _AROUND)) / _AROUND
+    for at in range(0, t.size - 1, _CHUNK):
+        first = max(at - 2 * _AROUND, 0)
+        step = np.diff(t[first : at + _CHUNK + 2 * _AROUND]) - dt
+        ahead = np.convolve(step, weights)[_AROUND - 1 : 1 - _AROUND] > 0.5 * dt
+        for start, stop in true_runs(ahead):
+            k = first + int(start + np.argmax(step[start:stop])) + 1
+            if at < k <= at + _CHUNK:
+                yield k
 
 
 def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> Clock:
@@ -220,7 +291,7 @@ def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> 
     low, high = rate_bounds(t, _rounding(resolution, dt))
     jitter, start = 0.0, float(t[0])
     if low > high:
-        residual = residual_of(t)
+        residual = _residual_of(t)
         deviation = float(np.abs(residual).max())
         jitter, start = deviation / dt, float(t[0] - residual[0])
         slack = 2 * deviation / float(t[-1] - t[0])

@@ -15,17 +15,17 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
-from piezo_ident.record.arrays import read_hdf5, read_mat, read_npz, read_parquet, read_tdms
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
 from piezo_ident.record.bags.recover import storage_of
 from piezo_ident.record.bags.write import write_bag
 from piezo_ident.record.channels import channel_of_column, column_of, role_of
-from piezo_ident.record.columns import RecordTable
 from piezo_ident.record.options import ReadOptions, unit_factor
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.record.tables import Blocks, blocks_of, labels_of, write_mat, write_npz
-from piezo_ident.record.text_table import read_text, write_csv
+from piezo_ident.record.tables.arrays import read_hdf5, read_mat, read_npz, read_parquet, read_tdms
+from piezo_ident.record.tables.columns import RecordTable
+from piezo_ident.record.tables.text_table import read_text, write_csv
+from piezo_ident.record.tables.write import Blocks, blocks_of, labels_of, write_mat, write_npz
 
 READERS: Mapping[str, Callable[[Path, ReadOptions], RecordTable]] = {
     **dict.fromkeys(('.csv', '.txt', '.tsv', '.dat', '.lvm', '.asc'), read_text),
@@ -74,7 +74,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     Returns
     -------
     Record
-        In SI units; its `faults` say what was wrong with the data and what was done about it.
+        In SI units; its `faults` name every fault of the data, and how it was met.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def write(
     Parameters
     ----------
     record : Record
-        What to write; its faults are no part of any file.
+        No file keeps its faults.
     path : path
         Where to; nothing is left there when writing fails.
     overwrite : bool

@@ -4,10 +4,9 @@
 """
 Readings that jump away from a signal and come back: what a sound signal does not do.
 
-Jumps are steps far beyond those around them.  They cut the signal into parts.  Of all ways to keep
-parts and leave out others, the cheapest is taken: a sample left out costs 1, a jump kept costs
-`JUMP`, or nothing where the voltage explains it, and parts that go on where the one before them
-ended cost nothing.
+Jumps are steps far beyond those around them.  They cut the signal into parts, of which some are
+left out, at the least cost.  A sample left out costs 1.  A jump that is kept costs `JUMP`, or 0
+where the voltage explains it.  A part that goes on where the last kept part ended costs 0.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from piezo_ident.common.arrays import Array, Integers, interpolated, Mask, true_
 from piezo_ident.common.kernel import kernel
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-#: a jump is this share of the stroke at least, and so many of the steps usual around it; so many
-#: of them are looked at on either side (taste: white noise reaches 6.7 of its median step)
+#: a jump has this share of the stroke at least, and so many times the usual step of so many
+#: samples on either side (taste: white noise reaches 6.7 times its median step)
 LEAST, FAR, AROUND = 2e-3, 8.0, 16
 WIDTH = 2 * AROUND + 1
 #: samples looked at together, so that temporaries stay small beside a long record
@@ -31,8 +30,8 @@ _CHUNK = 1 << 20
 CODES = 3.0
 #: a quantile that holds where half of all steps are jumps, and the median over it, of normal ones
 QUANTILE = 0.3, 1.75
-#: rms of second over that of first differences where steps have no memory; white noise has 1.73, a
-#: sine of five samples a period 1.18; the share of the stroke from which steps are large
+#: ratio of the rms of second and first differences of steps without memory (white noise: 1.73, a
+#: sine of five samples a period: 1.18); share of the stroke from which steps are large
 ROUGH, LARGE = 1.3, 0.1
 #: samples that a jump costs: up to nine wild readings in a row, which two jumps enclose, are left
 #: out whether they are alike or not
@@ -41,8 +40,8 @@ JUMP = 5
 LONGEST = 0.1
 #: parts behind one that may go on where it ended
 PARTS = 256
-#: the voltage explains a jump where it asks for this share of it in one step, and a stage answers
-#: by up to so many times the path that is asked for; it answers a step for so many samples
+#: the voltage explains a jump where one step asks for this share of the jump; a stage moves by up
+#: to so many times the path that the voltage asks for, and answers a step for so many samples
 STEPS, OVER, RINGS = 0.3, 1.5, 30
 
 
@@ -77,7 +76,7 @@ def wild_readings(
     """
     if error.size < 2:
         return np.zeros(error.size, dtype=bool)
-    # without noise what moves is wild; the codes of a coarse sensor are those of what is measured
+    # without noise every step is wild; the codes of a coarse sensor are those of the measurement
     noise = float(np.median(np.abs(np.diff(error))))
     codes = CODES * step if np.isfinite(step) else 0.0
     floor = max(LEAST * stroke, FAR * noise, codes)

@@ -26,7 +26,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 @dataclass(frozen=True)
 class ReadOptions:
     """
-    How records are read; what does not concern a format is not looked at.
+    How records are read; each format uses the options that concern it.
 
     Parameters
     ----------

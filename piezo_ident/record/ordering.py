@@ -4,10 +4,10 @@
 """
 Rows in the order of time: repeats go, restarts are found, disorder is refused.
 
-Time that jumps back is a restart when both stretches hold at least ten samples and the jump ends
-at or before the stamp where the first stretch began, or goes back by more than a thousand
-samples (ten blocks).  Rows that merely repeat earlier ones are dropped, unless they start over
-from the beginning and go on for more than two blocks: a simulation without noise, run again.
+Time that jumps back is a restart between two stretches of ten samples or more.  The jump ends at
+or before the first stamp of the first stretch, or goes back by more than a thousand samples (ten
+blocks).  Rows that repeat earlier rows are dropped, unless they start over from the beginning and
+go on for more than two blocks: a simulation without noise, run again.
 
 Time may be rounded more coarsely than its samples follow each other.  At 5 kHz, stamps in whole
 milliseconds come five at a time.  They still bound the sampling rate, the more closely the longer

@@ -4,10 +4,10 @@
 """
 The voltage of a record without the noise of its own measurement.
 
-Many labs record the monitor of the amplifier and not the command.  Its noise is a path of many
-spans in a minute, which no hysteresis follows: laws with lags along the path would follow time,
-and a hold would be none.  Where the voltage is quiet but for noise, a play that is as wide as the
-noise stands in for it; where it moves, it stays as it is.
+Many labs record the monitor of the amplifier instead of the command.  The noise of a monitor adds
+a path of many spans in a minute, and the stage does not follow that path: laws with lags along the
+path would follow time, and a hold would be a motion.  A play as wide as the noise replaces the
+voltage where only noise moves it.  Elsewhere the voltage stays.
 """
 
 from __future__ import annotations

@@ -286,7 +286,7 @@ class Record(Showable):
         Returns
         -------
         Record
-            In SI units; its `faults` say what was wrong with the data and what was done about it.
+            In SI units; its `faults` name every fault of the data, and how it was met.
 
         Raises
         ------

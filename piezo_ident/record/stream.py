@@ -4,8 +4,8 @@
 """
 The blocks of one topic as they come, in buffers that a copy shares.
 
-The samples of a long bag are spooled to temporary files, and read back as memory maps: a record of
-an hour then needs no memory of its own, and every part of the package takes it as any other.
+The samples of a long bag are spooled to temporary files, and read back as memory maps.  A record
+of an hour then needs no memory of its own, and is an ordinary array to the rest of the package.
 """
 
 from __future__ import annotations

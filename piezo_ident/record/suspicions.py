@@ -103,7 +103,7 @@ def _slow(record: Record) -> list[str]:
         return []
     return [
         f'{record.name}: one reading of the displacement stands in {m} samples each: its sensor '
-        'is slower than the voltage, and neither delay nor fast motion are those of the stage. '
+        'is slower than the voltage, and hides the delay and the fast motion of the stage. '
         f'Record both at one rate, or keep one row in {m}, that with the new reading'
     ]
 

@@ -175,7 +175,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 def remains(result: Diagnosis) -> list[tuple[str, str]]:
-    """Return what is left, what the errors stand for, H, the noise, and what would be found."""
+    """Return rows on the rest, the range of the errors, H, noise, and the detectable size."""
     left, smallest, floor = result.unexplained, result.smallest_detectable, result.noise_floor
     source = result.noise_source.removeprefix(UNKNOWN)
     rest = f': {left.description}' if left.description else ''
@@ -359,7 +359,7 @@ def diagnosis_page(
 
 
 def diagnosis_text(result: Diagnosis | EachAxis[Diagnosis]) -> str:
-    """Return verdict, errors before and after, what was added and what was not, for a terminal."""
+    """Return verdict, errors before and after, and the effects tried, for a terminal."""
     if isinstance(result, EachAxis):
         return result.told(diagnosis_text)
     alike = _alike(result)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What to do after a result: a reason and a command line each, the most useful first."""
+"""Suggestions after a result: a reason and a command line each, the most useful first."""
 
 from __future__ import annotations
 
@@ -200,8 +200,8 @@ def _means(v: Array, rate: float) -> Array:
 
 def _experiment(reason: str, program: str, model: StageModel, prompt: Prompt) -> Step:
     low, high = model.scaling.range
-    # noise at the ends of a measured voltage would ask an amplifier for what it does not give;
-    # what is rounded is less than what counts as extrapolation
+    # noise at the ends of a measured voltage may exceed the range of the amplifier; rounding
+    # changes the ends by less than an extrapolation
     digits = -math.floor(math.log10(1.5e-3 * (high - low)))
     ends = [f'{round(end, digits) + 0.0:.12g}' for end in (low, high)]
     return Step(

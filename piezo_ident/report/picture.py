@@ -40,9 +40,9 @@ def plot(result: Result | Record) -> Figure:
     """
     Draw the picture that tells most of a result.
 
-    Of an identification that is the hysteresis loop, measured and modelled, with the error; of a
-    free run the longest piece over time; of a diagnosis the residual before and after; of an
-    inverse the voltage and where it leads; of a record voltage and displacement over time.
+    An identification is drawn as its hysteresis loop, measured and modelled, with the error.  A
+    free run is its longest piece over time.  A diagnosis is the residual before and after.  An
+    inverse is the voltage with the motion.  A record is voltage and displacement over time.
 
     Parameters
     ----------

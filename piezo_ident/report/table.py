@@ -41,7 +41,7 @@ class Table:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What each column holds on a page: numbers (empty), a word (text), or prose."""
+        """Kind of each column on a page: numbers (empty), a word (text), or prose."""
         longest = [max(map(len, column), default=0) for column in zip(*self.rows, strict=True)]
         kinds = zip(self.text_columns, longest, strict=False)
         return tuple(

@@ -52,9 +52,9 @@ def to_json(
     Returns
     -------
     dict
-        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  What is unknown or not
-        finite is None; but a parameter of an effect that is infinite becomes the text ``inf`` or
-        ``-inf``, and the overall error of a model that diverged the largest number there is.
+        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  Numbers that are unknown
+        or infinite are None, with two exceptions: an infinite parameter of an effect is the text
+        ``inf`` or ``-inf``, and the overall error of a model that diverged is the largest float64.
     """
     if isinstance(result, EachAxis):
         return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}

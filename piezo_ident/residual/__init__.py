@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a model leaves: noise floor, lines, dependence and faults of the data."""
+"""Noise floor, lines, dependence and faults of the data in the residual of a model."""
 
 from piezo_ident.residual.analysis import analyse, ResidualAnalysis
 from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest, without_channels

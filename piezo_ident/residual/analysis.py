@@ -19,7 +19,7 @@ from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
 @dataclass(frozen=True, eq=False)
 class ResidualAnalysis:
-    """What the residual of a model shows; the parts are as they were given."""
+    """Noise floor, lines, curves and coherence of a residual; the parts are as they were given."""
 
     parts: tuple[ResidualPart, ...]
     floor: NoiseFloor

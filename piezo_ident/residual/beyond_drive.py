@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a residual holds that no function of the drive makes, and whether a channel makes it."""
+"""Tests of further channels as a cause of a residual that no function of the drive explains."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WHITE, LEVEL = 32, 0.1
 SIGNIFICANT = 1e-5
 #: share of the gain that must be left where it was not fitted, and parts held out in turn
 KEPT, FOLDS = 0.5, 5
-#: share of a record around no shift that is no surrogate
+#: shifts by less than this share of a record are not used as surrogates
 AROUND = 0.05
 
 
@@ -88,23 +88,25 @@ def _slow(n: int) -> Array:
 
 
 def _solve(A: Array, e: Array) -> Array:
-    """Return the least squares of scaled columns, directions that are rounding left out."""
-    N = A.T @ A
-    scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
-    values, vectors = linalg.eigh(N / scale / scale[:, None])
-    kept = values > RANK**1.5 * values[-1]
-    part = vectors[:, kept]
-    return np.asarray(part @ ((part.T @ (A.T @ e / scale)) / values[kept]) / scale)
+    """Return the least squares of columns (n, k), directions that are rounding left out."""
+    scale, values, vectors = _directions(A, RANK**1.5)
+    return np.asarray(vectors @ ((vectors.T @ (A.T @ e / scale)) / values) / scale)
 
 
 def _basis(A: Array, rank: float) -> tuple[Array, Array]:
     """Return an orthonormal basis of columns (n, k), and the combinations that make it."""
+    scale, values, vectors = _directions(A, rank)
+    made = vectors / np.sqrt(values) / scale[:, None]
+    return A @ made, made
+
+
+def _directions(A: Array, rank: float) -> tuple[Array, Array, Array]:
+    """Return the sizes of columns, and what their products have above a share of the largest."""
     N = A.T @ A
     scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
     values, vectors = linalg.eigh(N / scale / scale[:, None])
     kept = values > rank * max(float(values[-1]), 1e-300)
-    made = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
-    return A @ made, made
+    return scale, values[kept], vectors[:, kept]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +130,10 @@ def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
     """
     Return for every further channel of records what it explains that the drive cannot.
 
-    Residual and channel are freed of functions of the drive (`drive_functions`), weighted by the
-    level of the residual around, so that what is still counts, and made white.  Then the channel
-    with its plays and low-passes explains what it explains, and circular shifts of the residual
-    say what an unrelated one would.
+    Functions of the drive (`drive_functions`) are subtracted from residual and channel.  Both are
+    divided by the level of the residual nearby, so that quiet stretches count, and made white.
+    The channel, its plays and its low-passes then explain a share of the residual.  Circular
+    shifts of the residual tell the share that an unrelated channel explains.
 
     Notes
     -----
@@ -154,7 +156,7 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     if not moves or _follows(having, name, found):
         return ChannelTest(name)
     levels = [_level(p) for p in found]
-    # what the channel adds is not made white: of a single tone nothing would be left
+    # only the rest is made white: whitening would remove a channel that is a single tone
     at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(found, levels, strict=True)]
     white = _whitening(np.concatenate(at_level))
     weighed = list(zip(found, levels, strict=True))
@@ -181,7 +183,7 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
 def without_channels(
     parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
 ) -> list[ResidualPart]:
-    """Return parts without what significant channels add, so that their lines are not hum."""
+    """Subtract what significant channels add, so that lines of a channel do not pass for hum."""
     # the voltage and the displacement of one axis tell the same, and each was tested alone
     of_axis: dict[str, list[list[ResidualPart]]] = {}
     for t in tests:

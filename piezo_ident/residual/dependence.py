@@ -30,7 +30,7 @@ class Curve:
     against : {'v', 'dv/dt', 'time since the step'}
     branch : {'up', 'down', 'both'}
         Direction of the drive.  'both': the residual is multiplied by the step as a share of the
-        largest, so that what follows the drive adds up.
+        largest step, so that upward and downward steps add up.
     x : ndarray, shape (m,)
         Mean of the quantity in each bin.
     mean, std : ndarray, shape (m,)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
-from piezo_ident.record.faults import quantum_of, white_noise
+from piezo_ident.record.faults import end_of_rest, MOVED, quantum_of, STUCK, white_noise
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
@@ -53,7 +53,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     """
     Look for outliers, clipping, coarse steps, jitter and knocks: one fault for each part and kind.
 
-    What the readings alone show is left out before, by `piezo_ident.record.faults`.
+    `piezo_ident.record.faults` has left out the faults that the readings alone show.
     """
     faults: list[Fault] = []
     found: list[Mask] = []
@@ -82,6 +82,10 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
 
 def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> list[Fault]:
     action = 'left in, as they are the way of the data' if many else 'left out'
+    told = {
+        'outliers': (outliers, f'isolated jumps; {action}'),
+        'clipping': (clipped, 'at the end of their range while the model moves; left out'),
+    }
     return [
         Fault(
             name,
@@ -89,14 +93,7 @@ def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> li
             int(mask.sum()),
             what,
         )
-        for name, mask, what in (
-            ('outliers', outliers, f'isolated jumps; {action}'),
-            (
-                'clipping',
-                clipped,
-                'readings at the end of their range while the model moves; left out',
-            ),
-        )
+        for name, (mask, what) in told.items()
         if mask.any()
     ]
 
@@ -203,11 +200,10 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
         for a, b in true_runs(at):
             if b - a < FLAT:
                 continue
-            # a delay lets the end of a rest look as if v moved on
-            late = b - min((b - a) // 4, round(0.002 * part.piece.sample_rate))
+            late = end_of_rest(part.piece, a, b)
             moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
             gone = moved > LEFT * (noise.rms + noise.quantum) and moved > 1e-4 * stroke
-            if drive > 1e-4 * span and (gone or (drive > 0.02 * span and b - a >= 4 * FLAT)):
+            if drive > 1e-4 * span and (gone or (drive > MOVED * span and b - a >= STUCK)):
                 # what reads the same elsewhere has been cut off there too
                 found |= at
                 break
@@ -219,9 +215,9 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     Return the rms scatter of the sampling instants [s], and by how much the variance grows.
 
     A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
-    sigma^2 + jitter^2 (dy/dt)^2.  Third differences keep what a model misses out of it, where
-    the motion is smooth; what is left of it grows with the motion's own third differences, which
-    are a second cause, and where they are large nothing is read.
+    sigma^2 + jitter^2 (dy/dt)^2.  Third differences remove the error of the model where the motion
+    is smooth.  The rest of that error grows with the third differences of the motion: they are the
+    second cause in the regression, and blocks where they are large are not used.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)
@@ -250,7 +246,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
     slope2, error = _slope(s2, motion2, h2)
     if slope2 <= SURE * error:
         return 0.0, 1.0
-    # what a model misses is smooth; jitter is another from sample to sample
+    # the error of a model is smooth; jitter changes from sample to sample
     anticorrelated = float(np.mean(neighbours)) < 0.0
     apart = _slope(s2, motion2, -neighbours)[0] / slope2 if anticorrelated else 0.0
     if not WHITE[0] < apart < WHITE[1]:
@@ -261,7 +257,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
         # steps of a converter scatter with the speed as well
         return 0.0, 1.0
     growth = 1.0 + slope2 * float(np.quantile(s2, 0.98)) / base
-    # what saturates with speed, as a converter's own noise does, is no jitter
+    # the noise of a converter saturates with speed, jitter does not
     fast = s2 > np.median(s2)
     again, error = _slope(s2[fast], motion2[fast], h2[fast])
     if growth < GROWTH or again <= 3.0 * error or not 0.3 < again / slope2 < 3.0:

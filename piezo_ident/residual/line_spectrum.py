@@ -136,7 +136,7 @@ def _series(part: ResidualPart, start: int, x: Array, m: int, period: int = 0) -
 def _motions(
     part: ResidualPart, used: Sequence[tuple[int, int]], m: int, shortest: float
 ) -> list[Series]:
-    """Return what lies between the stretches used, freed of what the drive explains."""
+    """Return the stretches between those used, without what the drive explains."""
     piece, free = part.piece, part.joined
     for start, stop in used:
         free[start:stop] = False
@@ -223,8 +223,8 @@ class Spectrum:
         """
         Return the transform as a function of any frequency [Hz] among some of the grid f.
 
-        Seen from the middle of its stretch it is smooth: a spline of fifth degree errs by 1e-5 of
-        its maximum where the stretch is the whole search, and by far less where it is a part.
+        The transform is smooth when time counts from the middle of the stretch.  A spline of fifth
+        degree errs by 1e-5 of the maximum for the longest stretch, and by far less for others.
         """
         s = self.series
         # some more points, since a spline is worse at its ends

@@ -27,8 +27,8 @@ from scipy.special import gammaincc, gammaln
 LINES = 6
 #: chance of one false line in a search
 SIGNIFICANT = 1e-3
-#: lines below this share of the stroke are nothing's cause, converters make them; and below this
-#: share of the residual, which is never quite locked to the drive
+#: converters make lines below this share of the stroke; and lines below this share of the residual
+#: come from a motion that is nearly locked to the drive
 SMALLEST, SIDELINE = 1e-5, 0.01
 #: points of the common grid in one bin of the whole search
 FINE = 2.5
@@ -71,8 +71,8 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     """
     Search residuals of one sampling rate for narrow lines that are not locked to the drive.
 
-    Where v repeats, the residual of consecutive periods is subtracted: what the drive makes,
-    with all its harmonics, is gone, and a line of any other frequency stays with a known gain.
+    Where v repeats, the residuals of consecutive periods are subtracted.  The difference holds
+    nothing that the drive makes, and a line of any other frequency with a known gain.
     """
     series, rate, high = series_of(parts, stretches)
     if not series:
@@ -105,7 +105,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
             if crowd:
                 found = [line for line in found if line not in crowd]
                 keep &= np.abs(f - frequency) > BESIDE * frequency
-        # what was refined may lie some bins away from what stood out
+        # the refined frequency may lie some bins away from the highest gain
         keep &= np.minimum(np.abs(f - frequency), np.abs(f - f[best])) > 2.0 / longest
     return LineSearch(_grouped(found, 2.0 / longest), searched)
 
@@ -143,8 +143,8 @@ class _Search:
         """
         Return for every f -ln of its chance under noise alone, and the gain.
 
-        The gain is what a sine takes off the weighted squares: its maximum is the frequency,
-        while the chance also depends on how well the noise is known there.
+        The gain is the sum of weighted squares that a sine explains, and has its maximum at the
+        frequency of the line.  The chance depends on how well the noise is known there, too.
         """
         n = self._f.size
         total, gain = np.zeros(n), np.zeros(n)

@@ -19,8 +19,8 @@ ORDER = 3
 FRAME = 0.25
 #: share at the start of a rest that is left out, and at least this time [s]
 SETTLING, SETTLING_TIME = 0.2, 0.02
-#: share of its rms that the third differences of a white residual tell at least, and samples that
-#: are enough for it (level of the test: the estimate scatters by 2 % over so many)
+#: a residual is white where its third differences tell this share of its rms at least, over so
+#: many samples (level of the test: the estimate then scatters by 2 %)
 WHITE, FEWEST = 0.95, 2000
 #: most blocks a table of block lengths goes up to
 LONGEST_BLOCK = 4096
@@ -106,12 +106,12 @@ def residual_noise_floor(
     """
     Return the noise floor of residuals.
 
-    Where v repeats, the residual's differences between consecutive periods, from the second
-    period on, have twice the variance of the noise; whatever a model may lack repeats and drops
-    out, and slow drift is taken from the differences.  Only without repeats are the rests taken:
-    freed of parabolas in time and in its logarithm, which is how creep goes.  Of several stretches
-    the weighted median counts, so that one that is still settling does no harm.  Without either,
-    a residual that is white throughout is noise: no model leaves what has no memory.
+    The difference of two consecutive periods of a repeating v, from the second period on, has
+    twice the variance of the noise.  The error of the model repeats and drops out; slow drift is
+    subtracted.  Rests are used only without repeats, freed of parabolas in time and in the
+    logarithm of time, which describe creep.  The weighted median over the stretches counts, so
+    that a stretch that is still settling does no harm.  Without repeats and rests, a residual that
+    is white throughout is noise: the error of a model has a memory.
 
     Notes
     -----

@@ -216,10 +216,10 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
     """
     Return where a signal repeats itself: (first sample, behind the last, period), in order.
 
-    Candidates are minima of the mean square difference between the signal and itself shifted,
-    behind its first maximum; each is then held against the signal sample by sample, so that what
-    comes before and after does no harm.  At least three periods are asked for.  Motions of several
-    periods, one behind the other, hide each other: where nothing is found, halves are looked at.
+    A candidate is a minimum of the mean square difference between the signal and the same signal
+    shifted, behind the first maximum of that difference.  Each candidate is then compared sample
+    by sample, so that other motion before and after does no harm.  A repeat has three periods at
+    least.  Motions of several periods hide each other: without a repeat, both halves are searched.
 
     Notes
     -----
@@ -279,8 +279,8 @@ def _candidates(v: Array) -> list[int]:
     behind = int(np.argmax(d > 0.2 * top))
     minima = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] < d[2:])) + 1
     minima = minima[(minima > behind) & (d[minima] < 0.8 * top)]
-    # a long period is found exactly at the multiples of a short one that is no whole number, and
-    # one may follow the other: so the best of every octave
+    # a short period that is not a whole number of samples repeats exactly at its multiples, and a
+    # signal may have both periods in turn: so the best of every octave
     octave = np.floor(np.log2(np.maximum(minima, 1)))
     chosen: set[int] = set()
     for k in np.unique(octave):

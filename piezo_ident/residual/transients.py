@@ -43,10 +43,10 @@ def transients_in(part: ResidualPart, known: Mask, least: float) -> Transients:
     """
     Return the knocks in rests and in motion that repeats.
 
-    Of a motion that repeats, the median over its periods is taken away, and with it whatever a
-    model lacks; what is left must stand out of its own usual power, begin suddenly, be short, and
-    keep no place between the turns of the drive.  Samples `known` to be faulty do not count, nor
-    what is smaller than `least` [m].
+    The median over the periods is subtracted from a motion that repeats: whatever a model lacks
+    repeats too.  A knock stands out of the usual power of the rest, begins suddenly, is short, and
+    comes anywhere between two turns of the drive.  Samples `known` to be faulty do not count.  A
+    knock is larger than `least` [m].
     """
     found: list[tuple[float, float, float]] = []
     e = interpolated(part.e, known, part.mask)

@@ -16,7 +16,6 @@ import yaml
 
 #: content of a table, and what is said of it
 BAD_FILES: dict[str, tuple[Callable[[], str], str]] = {
-    'missing column': (lambda: csv_text('y'), 'add a column named y'),
     'text in numbers': (lambda: with_values('v', range(40, 41), 'off'), 'line 42'),
     'many NaN': (lambda: with_values('y', range(0, 1000, 50), 'nan'), 'cut the bad stretch'),
     'constant input': (
@@ -24,9 +23,6 @@ BAD_FILES: dict[str, tuple[Callable[[], str], str]] = {
         'while it is driven',
     ),
     'constant output': (lambda: csv_text(y=np.full(1000, 1e-6)), 'sensor'),
-    'empty file': (lambda: '', 'header line'),
-    'header alone': (lambda: 't,v,y\n', 'record some samples'),
-    'one sample': (lambda: 't,v,y\n0,0,0\n', 'at least two'),
     'wrong unit': (lambda: csv_text(y=7.5 * table()['v']), '--displacement-unit'),
     'unsorted time': (lambda: with_values('t', range(500, 501), 0.1234), ';'),
     'garbage': (lambda: '\x00\x01\x02\n\x03', ';'),
@@ -132,7 +128,7 @@ def test_what_cannot_work(capsys, tmp_path, made, monkeypatch, case):
     if case in OUTPUTS:
         for work in (
             'identify_command.identify',
-            'predict_command.free_run',
+            'model_command.free_run',
             'record_command.SimulatedStage',
         ):
             monkeypatch.delattr(f'piezo_ident.cli.{work}')

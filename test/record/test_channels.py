@@ -50,12 +50,6 @@ def record():
     return pi.Record.from_arrays(*(COLUMNS[k] for k in 'tvy'), channels=channels)
 
 
-@pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3'])
-def test_what_is_written_reads_back(record, tmp_path, name):
-    assert pi.write(record, tmp_path / name) == ()
-    assert_same(pi.read(tmp_path / name))
-
-
 @pytest.mark.parametrize('kind', ['hdf5', 'parquet'])
 def test_formats_that_are_read_only(tmp_path, kind):
     path = tmp_path / f'r.{kind}'

@@ -263,8 +263,8 @@ def lossy(y, kind, share, length):
     return np.where(bad, values[kind], y), bad
 
 
-@pytest.mark.parametrize('offset', [0.0, 40e-6, -37e-6])
-@pytest.mark.parametrize('length', [1, 3, 7, 30])
+@pytest.mark.parametrize('offset', [0.0, -37e-6])
+@pytest.mark.parametrize('length', [1, 7, 30])
 @pytest.mark.parametrize('kind', ['zero', 'full scale'])
 def test_a_tenth_of_the_readings_may_be_lost(kind, length, offset):
     record, bad = slow_record(offset, sound=False, kind=kind, share=0.1, length=length)

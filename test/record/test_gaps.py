@@ -95,13 +95,11 @@ def test_what_does_not_connect_stays_apart():
 @pytest.mark.parametrize(
     'lose',
     [
-        lambda n: np.arange(n) == 150_000,
         lambda n: np.random.default_rng(0).random(n) < 0.002,
-        # 0.2 s in the middle of the noise, 0.8 s in the triangle
-        lambda n: (np.arange(n) >= 120_000) & (np.arange(n) < 124_000),
+        # 0.8 s in the triangle
         lambda n: (np.arange(n) >= 240_000) & (np.arange(n) < 256_000),
     ],
-    ids=['one sample', '0.2 % of samples', 'hole in the noise', 'hole in the triangle'],
+    ids=['0.2 % of samples', 'hole in the triangle'],
 )
 def test_lost_samples_cost_next_to_nothing(whole, truth, lose):
     found = identify(with_losses(whole, lose(whole.n)))

@@ -379,22 +379,6 @@ def test_array_that_announces_too_much(tmp_path):
     refuse(path, 'damaged')
 
 
-@pytest.mark.parametrize('name', ['r.csv', 'r.npz', 'r.mat', 'r.mcap', 'r.db3'])
-def test_damaged_files(tmp_path, name):
-    path = tmp_path / name
-    path.write_bytes(b'')
-    refuse(path)
-    path.write_bytes(np.random.default_rng(0).bytes(5000))
-    refuse(path)
-    path.unlink()
-    pi.write(record(), path)
-    whole = path.read_bytes()
-    if name != 'r.csv':
-        for share in (0.1, 0.5, 0.9, 0.99):
-            path.write_bytes(whole[: int(share * len(whole))])
-            refuse(path)
-
-
 def test_matlab_73(tmp_path):
     path = tmp_path / 'r.mat'
     path.write_bytes(b'MATLAB 7.3 MAT-file'.ljust(512) + b'\x89HDF\r\n\x1a\n' + bytes(600))

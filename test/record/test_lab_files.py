@@ -13,9 +13,8 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main
 from piezo_ident.cli.console import Console
-from piezo_ident.cli.identify_command import prompt_of
+from piezo_ident.cli.files import read_all, spans
 from piezo_ident.cli.main import cli
-from piezo_ident.cli.records import read_all, spans
 from piezo_ident.common.errors import DataError
 import pytest
 import scipy.io
@@ -307,15 +306,6 @@ def test_one_run_of_several_in_groups(tmp_path, capsys):
     shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
     assert main(shlex.split(shown.replace('run1', 'run2'))) == 0
     np.testing.assert_array_equal(pi.read(out).pieces[0].v, V + 2)
-
-
-def test_commands_that_are_suggested_read_the_same_way():
-    options = ('--columns', 't=Zeit [s],v=2', '--rate', '5000', '--time-unit', 'ms')
-    args = cli.main(['identify', 'r.csv', *options], standalone_mode=False)
-    prompt = prompt_of(args, [], [])
-    assert prompt.reading == options
-    again = shlex.split(prompt.command('identify', 'r.csv'))[1:]
-    assert cli.main(again, standalone_mode=False) == args
 
 
 def test_segments_and_channels_of_other_names(tmp_path):

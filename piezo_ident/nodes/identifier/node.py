@@ -12,7 +12,7 @@ from pathlib import Path
 import time
 from typing import Any
 
-from piezo_ident.cli.outputs import check_folder
+from piezo_ident.cli.files import check_folder
 from piezo_ident.common.errors import Cancelled, DataError, PiezoIdentError
 from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Identification, Steps

@@ -123,8 +123,8 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file; `choices` replace fields of the options.
 
-    The order of the blocks is that of their log times.  Where the clock of these was set back,
-    the order of the file is taken.
+    Blocks come in the order of their log times, or in the order of the file where the clock of
+    the log was set back.
 
     Where the bag holds ``applied_voltage`` beside the voltage, samples that the amplifier's guard
     altered are cut out, as in a live capture.  DataError for a damaged bag, for blocks whose

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import check_regular, load_yaml
-from piezo_ident.record.arrays import library
 from piezo_ident.record.record import Fault
+from piezo_ident.record.tables.arrays import library
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -183,7 +183,7 @@ def _sidecars(file: Path) -> list[Path]:
 
 
 class _Part(NamedTuple):
-    """What one file holds, and what is wrong with it."""
+    """Contents and damage of one file."""
 
     connections: list[Connection]
     messages: Callable[[], Iterator[Stored]]

@@ -279,9 +279,9 @@ def write_bag(
     """
     Write a record as a rosbag2 folder, or as a single file when `path` ends in .mcap or .db3.
 
-    A block's log time is the time of its first sample.  Where the record starts before zero, or
-    its clock restarts, log times are moved later by whole seconds, so that they stay positive and
-    in the order of the messages; the samples keep their own times.  The storage of a folder is
+    A block's log time is the time of its first sample.  Log times have to be positive and to rise:
+    whole seconds are added where the record starts before zero or its clock restarts.  The samples
+    keep their own times.  The storage of a folder is
     mcap or sqlite3, mcap by default; the custom data, such as seed and program, join the
     ``sample_rate`` in the metadata.  DataError when the place is taken or cannot be written to.
     """

@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Pictures for people: what was measured, what the model makes of it, and how far they differ."""
+"""Pictures for people: measurement, model, and their difference."""

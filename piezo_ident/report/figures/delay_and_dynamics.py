@@ -92,7 +92,7 @@ def _draw_step(
     if modelled is not None:
         y_hat = np.maximum(1e9 * np.abs(modelled[near]), floor)
         axes.plot(lag, y_hat, color=COLOURS['model'], linewidth=1.2, label='model')
-    # what moves the other way first is no beginning of the response
+    # a motion to the other side does not begin the response
     back = step.response[near] * step.response[step.lag >= 0].sum() < 0.0
     dots: dict[str, Any] = {'color': COLOURS['measured'], 'markersize': 2.8}
     axes.plot(lag[~back], y[~back], 'o', label='measured', **dots)

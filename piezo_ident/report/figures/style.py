@@ -4,8 +4,8 @@
 """
 The looks of the pictures: colours, fonts, axes, and long traces without loss of their extremes.
 
-Everything is set on the objects themselves: neither pyplot nor the global settings are touched,
-so pictures can be drawn from any thread and beside a lab's own.
+Every setting is one of a figure: pyplot and the global settings stay as they are.  Pictures can
+be drawn from any thread, and beside those of a lab.
 """
 
 from __future__ import annotations

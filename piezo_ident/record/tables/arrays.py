@@ -5,7 +5,7 @@
 Records in files of named arrays: npz, MATLAB, HDF5, TDMS and Parquet, each by its library.
 
 A file whose arrays are called ``t``, ``v`` and ``y`` is read as it is.  In any other, all columns
-of numbers are looked at, and `piezo_ident.record.columns` tells which is which.
+of numbers are looked at, and `piezo_ident.record.tables.columns` tells which is which.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.files import UNPACKED_SIZE
 from piezo_ident.record.assemble import label_runs
-from piezo_ident.record.columns import choose, RecordTable, words_of
-from piezo_ident.record.mat_read import flat, read_variables
 from piezo_ident.record.options import ReadOptions
+from piezo_ident.record.tables.columns import choose, RecordTable, words_of
+from piezo_ident.record.tables.mat_read import flat, read_variables
 
 _LABELS = ('segment_name', 'segment_start')
 _USED = '[tvy]|[vyx]_.+|segment_name|segment_start'

@@ -1,21 +1,23 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The records that are named on a command line."""
+"""The files of a command line: records that are read, and outputs, checked before the work."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields, replace
 import math
 import os
 from pathlib import Path
+import tempfile
 from types import SimpleNamespace
 from typing import Any
 
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.common.files import broken_link, check_replaceable, unwritable
 from piezo_ident.record import io as record_io
 from piezo_ident.record.bags.recover import storage_of
 from piezo_ident.record.io import READERS
@@ -32,6 +34,8 @@ UNCERTAIN = ('.txt', '.dat', '.asc')
 NOTES = 20_000
 #: what a folder is searched for
 RECORD_FILES = (*(x for x in READERS if x not in UNCERTAIN), *BAG_FILES)
+TABLE_FILES = ('.csv', '.npz')
+PICTURES = ('.png', '.pdf', '.svg')
 
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:
@@ -175,7 +179,7 @@ def spans(records: Sequence[Record]) -> str:
     ends = [end for record in records for end in record.voltage_range]
     parts = []
     for name, unit, x in (('stroke', 'um', strokes), ('voltage', 'V', ends)):
-        # of one that is not recorded nothing is known
+        # a displacement or voltage that was not recorded is NaN
         if all(map(math.isfinite, x)):
             both = dict.fromkeys(f'{end:.4g}' for end in (min(x), max(x)))
             parts.append(f'{name} {" to ".join(both)} {unit}')
@@ -183,7 +187,7 @@ def spans(records: Sequence[Record]) -> str:
 
 
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
-    """Print the faults of a record, and what the file it was written to cannot keep."""
+    """Print the faults of a record, and the losses of the file that it was written to."""
     for fault in record.faults:
         if fault.name not in SHOWN:
             console.say(f'met: {fault}')
@@ -192,7 +196,7 @@ def print_faults(record: Record, losses: Sequence[str], console: Console) -> Non
 
 
 def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
-    """Return what a record holds, its faults, and what its file cannot keep."""
+    """Return the size of a record, its faults, and the losses of its file, for programs."""
     return {
         'record': record.name,
         'pieces': len(record.pieces),
@@ -203,3 +207,88 @@ def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
         'faults': [asdict(fault) for fault in record.faults],
         'not_kept': list(losses),
     }
+
+
+# --- outputs
+
+
+def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
+    """Refuse a suffix that names no format."""
+    known = list(suffixes)
+    if path.suffix.lower() not in known:
+        names = ', '.join(s or 'a folder' for s in known)
+        raise ConfigError(
+            f'{path}: {what} cannot be written as {path.suffix or "a folder"}; choose {names}'
+        )
+
+
+def check_output(
+    path: Path, suffixes: Iterable[str], what: str, *, inputs: Iterable[Path], overwrite: bool
+) -> None:
+    """Refuse a file whose suffix names no format, that is an input, or cannot be written."""
+    check_suffix(path, suffixes, what)
+    check_distinct(path, inputs)
+    check_file(path, overwrite=overwrite)
+
+
+def check_link(path: Path) -> None:
+    """Refuse a symbolic link that leads nowhere."""
+    broken = broken_link(path)
+    if broken:
+        raise DataError(f'{path}: {broken}')
+
+
+def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
+    """Refuse an output that could not be written in the end; a bag may be a folder too."""
+    check_link(path)
+    try:
+        if path.is_dir() and not folder_too:
+            raise DataError(f'{path}: is a folder; name a file')
+        if path.is_dir():
+            check_replaceable(path)
+        if path.exists() and not (path.is_dir() or path.is_file()):
+            raise DataError(f'{path}: is a device, no file; choose another name')
+        if (path.exists() or path.is_symlink()) and not overwrite:
+            raise DataError(f'{path}: exists already; choose another name or add --overwrite')
+        if not path.parent.exists():
+            raise DataError(f'{path}: there is no folder {path.parent}; make it first')
+        _try(path.parent)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder in which files could not be written in the end; it need not exist yet."""
+    check_link(path)
+    try:
+        if path.exists() and not path.is_dir():
+            raise DataError(f'{path}: is a file; name a folder')
+        here = path.absolute()
+        while not here.exists():
+            check_link(here)
+            here = here.parent
+        _try(here)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
+    """Refuse to write a result over one of its inputs."""
+    if output.exists() and any(p.exists() and output.samefile(p) for p in inputs):
+        raise DataError(f'{output}: is one of the inputs; choose another name')
+
+
+def check_apart(output: Path, record: Path) -> None:
+    """Refuse to write a record over another, into the folder of it, or where that lies below."""
+    # pathlib has an error of its own for links in a circle
+    out, given = (Path(os.path.realpath(path)) for path in (output, record))
+    if out == given or out in given.parents or given in out.parents:
+        raise DataError(
+            f'{output}: is the input {record}, lies in it or holds it; choose another name'
+        )
+
+
+def _try(folder: Path) -> None:
+    # root passes every permission bit, and a read-only file system shows only when written to
+    with tempfile.TemporaryFile(dir=folder, prefix='.piezo_ident.'):
+        pass

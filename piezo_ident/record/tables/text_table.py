@@ -4,7 +4,7 @@
 """
 Records in text: CSV as spreadsheets of any country write it, and what LabVIEW and others write.
 
-`piezo_ident.record.text_layout` finds the table; NumPy reads its numbers.
+`piezo_ident.record.tables.text_layout` finds the table; NumPy reads its numbers.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.assemble import label_runs
-from piezo_ident.record.columns import choose, rate_option, RecordTable
 from piezo_ident.record.options import ReadOptions
-from piezo_ident.record.tables import Blocks, ROWS
-from piezo_ident.record.text_layout import COMMENT, find_layout, is_number, Layout
+from piezo_ident.record.tables.columns import choose, rate_option, RecordTable
+from piezo_ident.record.tables.text_layout import COMMENT, find_layout, is_number, Layout
+from piezo_ident.record.tables.write import Blocks, ROWS
 
 #: lines in which the table begins
 HEAD = 1000

@@ -1,0 +1,319 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""``predict``, ``invert`` and ``export``: what a model is for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+import math
+from pathlib import Path
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from piezo_ident.cli.console import Console, deferred_interrupts
+from piezo_ident.cli.files import (
+    check_order,
+    check_output,
+    data_of,
+    PICTURES,
+    print_faults,
+    read_all,
+    TABLE_FILES,
+)
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ConfigError, DataError, naming
+from piezo_ident.common.files import write_text
+from piezo_ident.control.inverse import Inverse
+from piezo_ident.model.free_run import FreeRun, FreeRunErrors
+from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel, voltage_of
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.channels import role_of
+from piezo_ident.record.io import write_columns
+from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.tables.write import blocks_of
+from piezo_ident.verbs.export import export_c
+from piezo_ident.verbs.use import free_run, invert, MultiAxisInverse, predict, prediction_doubts
+
+SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
+
+
+def _checked(args: SimpleNamespace, what: str) -> StageModel | MultiAxisModel:
+    """Return the model; refuse outputs that cannot be written, and files in the wrong order."""
+    for path, suffixes, content in (
+        (args.out, TABLE_FILES, what),
+        (args.plot, PICTURES, 'a picture'),
+    ):
+        if path is not None:
+            inputs = args.model, args.record
+            check_output(path, suffixes, content, inputs=inputs, overwrite=args.overwrite)
+    check_order(args.model, args.record, args.verb)
+    return load(args.model)
+
+
+def _wrote(args: SimpleNamespace, console: Console) -> dict[str, str | None]:
+    """Print which files were written, and return them for programs."""
+    files: dict[str, Path | None] = {'out': args.out, 'plot': args.plot}
+    for path in filter(None, files.values()):
+        console.say(f'wrote {path}')
+    return {key: None if path is None else str(path) for key, path in files.items()}
+
+
+def predict_command(args: SimpleNamespace, console: Console) -> None:
+    """``piezo_ident predict``."""
+    model = _checked(args, 'a prediction')
+    (record,) = read_all([args.record], args, console, voltage_alone=True)
+    data: dict[str, Any] = {'model': str(args.model)}
+    # nothing that stands in for a reading is written as one
+    columns: dict[str, Sequence[Array]] = {}
+    if record.is_measured:
+        with naming(str(args.model)):
+            run = free_run(model, record)
+        console.say(f'{args.model} on {record.name}, free run:')
+        data |= print_run(run, console)
+        runs = {**run} if isinstance(run, EachAxis) else {'y': run}
+        lost = sum(x.record.n - x.errors.n for x in runs.values())
+        if lost and args.out is not None:
+            console.say(f'  {lost} readings are left out: y is nan there in {args.out}')
+        # without faulty samples
+        record = runs['y'].record if isinstance(run, FreeRun) else record
+        pieces = {axis: x.pieces for axis, x in runs.items()}
+        for axis, x in runs.items():
+            columns[axis] = [piece.measured for piece in x.record]
+        if args.plot is not None:
+            from piezo_ident.report import save_plot
+
+            with deferred_interrupts():
+                save_plot(run, args.plot)
+    else:
+        if args.plot is not None:
+            raise ConfigError(
+                f'{record.name}: has no displacement to compare with; leave out --plot'
+            )
+        with naming(str(args.model)):
+            made = predict(model, record)
+        pieces = {**made} if isinstance(made, EachAxis) else {'y': made}
+        warnings = prediction_doubts(model, record)
+        console.say(f'{args.model} on {record.name}, which has no displacement: no error is known')
+        for warning in warnings:
+            console.say(f'  warning: {warning}')
+        data['warnings'] = list(warnings)
+    if args.out is not None:
+        with deferred_interrupts():
+            for axis, parts in pieces.items():
+                if axis != 'y':
+                    v = voltage_of(axis)
+                    columns[v] = [piece.channels[v] for piece in record]
+                columns[f'y_hat{axis[1:]}'] = parts
+            _write_prediction(record, columns, args.out)
+    print_faults(record, (), console)
+    console.result({**data, **data_of(record), **_wrote(args, console)})
+
+
+def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], path: Path) -> None:
+    blocks = blocks_of(record, **columns)
+
+    def known() -> Iterator[dict[str, Array]]:
+        for block in blocks():
+            yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
+
+    write_columns(path, known)
+
+
+def print_run(run: FreeRun | EachAxis[FreeRun], console: Console) -> dict[str, Any]:
+    """Print the errors of a free run, of each axis where there are several, and return them."""
+    if not isinstance(run, EachAxis):
+        print_errors(run, console)
+        return error_data(run)
+    for axis, x in run.items():
+        console.say(f' axis {axis}:')
+        print_errors(x, console)
+    return {'axes': {axis: error_data(x) for axis, x in run.items()}}
+
+
+def print_errors(run: FreeRun, console: Console) -> None:
+    """Print the errors of a free run, and what it warns of."""
+    rows = [('whole record', run.errors)]
+    if any(run.estimated):
+        if run.errors_after_start is None:
+            console.say('  no sample at which the start is forgotten: drive a wider range')
+        else:
+            rows.append(('start forgotten', run.errors_after_start))
+    for name, e in rows:
+        console.say(
+            f'  {name:16s} {e.percent:8.3g} % of stroke   fit {e.fit:8.3f} %   {e.n} samples'
+        )
+        if e.mostly_offset:
+            from piezo_ident.report import length
+
+            console.say(
+                f'  {"":16s} {e.percent_without_offset:8.3g} % after removing a mean of '
+                f'{length(e.offset)}'
+                + (': the sensor was set to zero elsewhere' if e.only_offset else '')
+            )
+    console.say(f'  % of stroke = {FORMULA}; fit = 100 (1 - |y - y_hat| / |y - mean y|)')
+    for warning in run.warnings:
+        console.say(f'  warning: {warning}')
+
+
+def error_data(run: FreeRun) -> dict[str, Any]:
+    """Return the errors of a free run for programs."""
+
+    def row(errors: FreeRunErrors) -> dict[str, Any]:
+        return {
+            'percent_of_stroke': errors.percent,
+            'fit_percent': errors.fit,
+            'n': errors.n,
+            'offset': errors.offset,
+            'percent_of_stroke_without_offset': errors.percent_without_offset,
+        }
+
+    late = run.errors_after_start
+    return {
+        'formula': FORMULA,
+        'whole': row(run.errors),
+        'start_forgotten': None if late is None else row(late),
+        'memory_estimated': list(run.estimated),
+        'warnings': list(run.warnings),
+    }
+
+
+def invert_command(args: SimpleNamespace, console: Console) -> None:
+    """``piezo_ident invert``."""
+    model = _checked(args, 'a voltage')
+    (reference,) = read_all([args.record], args, console, displacement_alone=True)
+    piece = _whole(reference, model)
+    further = {k: x for k, x in piece.channels.items() if role_of(k) != 'y'}
+    options = {'limits': args.limits, 'slew': args.slew or np.inf, 'clip': args.clip}
+    drive: Inverse | MultiAxisInverse
+    with naming(str(args.record), model=str(args.model)):
+        if isinstance(model, MultiAxisModel):
+            wanted = {
+                'y': piece.y,
+                **{k: x for k, x in piece.channels.items() if k not in further},
+            }
+            drive = invert(model, wanted, channels=further, **options)
+            axes, voltages = {**drive}, {**drive.voltages}
+        else:
+            model = replace(model, sample_rate=piece.sample_rate)
+            drive = invert(model, piece.y, channels=piece.channels, **options)
+            axes, voltages = {'y': drive}, {'v': drive.v}
+    console.say(f'{args.model}, told to move as {reference.name}:')
+    console.say(str(drive))
+    with deferred_interrupts():
+        if args.out is not None:
+            n = voltages['v'].size
+            columns = {'t': piece.start_time + (np.arange(n) - drive.lead) / piece.sample_rate}
+            columns |= voltages
+            write_columns(args.out, lambda: iter([columns]))
+        if args.plot is not None:
+            from piezo_ident.report import save_plot
+
+            save_plot(drive, args.plot)
+    print_faults(reference, (), console)
+    console.result(
+        {
+            'model': str(args.model),
+            'reference': str(args.record),
+            'formula': FORMULA,
+            **_told(axes['y'], piece.sample_rate),
+            'axes': {k: _told(x, piece.sample_rate) for k, x in axes.items()},
+            **_wrote(args, console),
+        }
+    )
+
+
+def _told(drive: Inverse, rate: float) -> dict[str, Any]:
+    """Return what there is to tell of a voltage, for programs."""
+    return {
+        'percent_of_stroke': drive.error,
+        'expected_percent_of_stroke': drive.expected,
+        'expected_offset': drive.expected_offset,
+        'lead': drive.lead,
+        'clipped': int(np.count_nonzero(drive.clipped)),
+        'voltage_range': [float(drive.v.min()), float(drive.v.max())],
+        'steepest': float(np.abs(np.diff(drive.v)).max()) * rate,
+        'warnings': list(drive.warnings),
+    }
+
+
+def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:
+    """Return a reference that is one piece at the rate of the model, or refuse it."""
+    (piece, *more) = reference
+    if more:
+        met = '; '.join(str(fault) for fault in reference.faults if not fault.is_note)
+        raise DataError(
+            f'{reference.name}: falls into {1 + len(more)} pieces; {met}; a wanted motion is one '
+            'piece: fill in what is missing'
+        )
+    if not model.takes(piece):
+        raise DataError(
+            f'{reference.name}: is sampled at {piece.sample_rate:g} Hz, the model at '
+            f'{model.sample_rate:g} Hz; write the motion at the rate of the model'
+        )
+    return piece
+
+
+def export_command(args: SimpleNamespace, console: Console) -> None:
+    """``piezo_ident export``."""
+    from piezo_ident.export.fmu import export_fmu
+
+    if args.out is None:
+        raise ConfigError('export: no file is named', options='--out stage.h')
+    suffixes = [SUFFIXES[args.format]] if args.format else SUFFIXES.values()
+    check_output(args.out, suffixes, 'a model', inputs=[args.model], overwrite=args.overwrite)
+    is_header = args.out.suffix.lower() == '.h'
+    if not is_header and (args.limits or args.slew or args.preview is not None):
+        raise ConfigError(
+            f'{args.out}: has no feed-forward, which --limits, --slew and --preview are for; '
+            'leave them out, or write a header .h'
+        )
+    name = args.name or re.sub(r'\W', '_', args.out.stem, flags=re.ASCII).lower()
+    model = load(args.model)
+    title = f'The stage of {args.model.name}'
+    header, functions = '', []
+    with naming(str(args.model)), deferred_interrupts():
+        if is_header:
+            header = export_c(
+                model,
+                name,
+                limits=args.limits,
+                slew=args.slew or math.inf,
+                preview=args.preview,
+                title=title,
+            )
+            write_text(args.out, header)
+            known = (f'{name}_step', f'{name}_feedforward_step')
+            functions = [function for function in known if f'{function}(' in header]
+        elif isinstance(model, MultiAxisModel):
+            raise ConfigError(
+                f'{args.model}: has several axes; an FMU holds one, write a header .h'
+            )
+        else:
+            export_fmu(model, args.out, name)
+    console.say(' '.join([f'wrote {args.out}', *([f'with {", ".join(functions)}'] * is_header)]))
+    ahead = re.search(r'_PREVIEW = (\d+)', header)
+    preview = int(ahead[1]) if ahead else None
+    if preview is not None:
+        console.say(
+            f'the feed-forward knows the motion {preview} samples ahead, '
+            f'{1e3 * preview / model.sample_rate:.4g} ms; --preview N makes it shorter'
+        )
+    if len(functions) == 1:
+        head = header.partition('There is no feed-forward:')[2].partition('*/')[0]
+        reason = ' '.join(word for word in head.split() if word != '*')
+        console.say(f'  warning: {args.model}: there is no feed-forward: {reason}')
+    console.result(
+        {
+            'model': str(args.model),
+            'out': str(args.out),
+            'format': 'c' if is_header else 'fmu',
+            'name': name,
+            'functions': functions,
+            'preview': preview,
+        }
+    )
