@@ -37,8 +37,8 @@ def _rows() -> list[dict[str, Any]]:
 
 HEAD = """# Reliability
 
-This page tells whoever connects an amplifier what was tried to break the drive, the graph and the
-files, and what happened.
+This page lists, for whoever connects an amplifier, the attempts to break the drive, the graph and
+the files, and their results.
 
 *Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
 its own rows. Every row can be run again with its command, from the root of the sources, after
@@ -56,9 +56,9 @@ further from the voltage before than the slew allows. Where limits are moved, th
 into them at the slew. Silence ends at rest by a ramp, a new stream is joined by a ramp, a second
 publisher moves nothing.
 
-`benchmarks/reliability/safety.py` has the property as code. It holds while the process that drives
-the amplifier lives and its converter keeps its last value when it dies: against SIGKILL and power
-failure only a watchdog in the amplifier helps ([My driver](driver.md)).
+`benchmarks/reliability/safety.py` has the property as code. The property holds while the process
+that drives the amplifier lives. Only a watchdog in the amplifier helps against SIGKILL and power
+failure ([My driver](driver.md)).
 
 ## Damaged files and kills
 
