@@ -194,6 +194,7 @@ def main() -> int:
     own_domain()
     parts = [
         '# The running graph, measured',
+        'This page shows the delays and losses of the nodes on one machine, measured by',
         f'    .venv/bin/python benchmarks/bench_live.py {shlex.join(sys.argv[1:])}',
         f'On {machine()}; load average before it {os.getloadavg()[0]:.1f}.',
         'Excitation, stage, identifier, model and recorder, each a process of its own, and an '

@@ -116,10 +116,10 @@ def main() -> None:
     text = [
         '# Table I, with a third row',
         '',
-        'Made by `make table-one`. Free-run error, rms(y - y_hat) / (max y - min y) in %, of '
-        'v = 5 + 5 sin(2 pi f t) in steady state. The stage has rate dependence and creep that '
-        'the model of the paper lacks; no record declares them, and their laws are not those of '
-        'the candidates (benchmarks/truths/table_one.py).',
+        'This page adds to Table I of the paper what a diagnosis gains. `make table-one` made it. '
+        'Errors are free-run errors, rms(y - y_hat) / (max y - min y) in %, of '
+        'v = 5 + 5 sin(2 pi f t) in steady state. The simulated stage has rate dependence and '
+        'creep, by other laws than the candidates (`benchmarks/truths/table_one.py`).',
         '',
         f'| | {" | ".join(f"{f} Hz" for f in PUBLISHED)} |',
         f'|---|{"---|" * len(PUBLISHED)}',
