@@ -54,8 +54,7 @@ class Parameter:
     scale : str
         How a fit moves the parameter: ``linear``, ``log`` (its logarithm) or ``fixed``.
     tries : tuple
-        For a parameter that is not an amplitude: values worth trying on any data; for a list,
-        lists.
+        For a parameter that is not an amplitude: values (or lists) worth trying on any data.
     first_stays : bool
         For a list over time: whether its first number stays fixed in a fit of one record with a
         free H, because H can do the same.
@@ -279,9 +278,8 @@ class Effect:
         """
         List the settings at which the effect is tried on given data.
 
-        By default these are all combinations of the `tries` of the shape parameters (those that
-        are not amplitudes), with all amplitudes moved.  A shape parameter with neither `tries`
-        nor a default leaves no trials.
+        By default, all combinations of the `tries` of parameters that are not amplitudes, with
+        all amplitudes moved.  Such a parameter needs `tries` or a default, or no trial is left.
         """
         shapes = [p for p in cls.parameters if not p.is_amplitude]
         choices = [p.tries or (() if p.default is None else (p.default,)) for p in shapes]
@@ -339,11 +337,10 @@ class Effect:
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """
-        Compute the derivatives of the output of `process` by parameters, by their names.
+        Compute derivatives of the output of `process` by the names of scalar parameters.
 
-        The memory stays unchanged.  Each derivative has shape (n,).  The method serves effects
-        around H and parameters that are single numbers.  By default it gives no derivatives, and
-        they are taken by differences.
+        Each has shape (n,), and the memory stays unchanged.  The method serves effects around H;
+        missing derivatives are taken by differences.
         """
         return {}
 
@@ -353,8 +350,7 @@ class Effect:
         """
         Yield the output of the slot ``hysteresis`` for each part of H alone; shapes (n,).
 
-        A part consists of plays only, or has no plays.  It comes with the outputs of its plays at
-        `rest`.
+        A part has plays only, or none; it comes with the outputs of its plays at `rest`.
         """
         for h, memory in parts:
             operator = type(self)(self.sample_rate, self.values, h, HysteresisOperator(h, memory))

@@ -57,9 +57,9 @@ MOST_CREEP = 0.1
 #: prior rms of the share of an element of creep, of a lag of creep as a share of the range, and of
 #: a share of the memory at a start around its first guess
 CREEP_SPREAD, LAG_SPREAD, START_SPREAD = 0.02, 0.5, 0.5
-#: prior rms of the density of H, twice the even density that would make the whole stroke, and of
-#: the changes of the density and of the slope behind a turning point over the range (taste: a
-#: quarter of that density, a third of the mean slope)
+#: prior rms of the density of H, prior rms of its change over the range, and prior rms of the
+#: change of the slope behind a turning point over the range.  The even density that makes the
+#: whole stroke is 2 (taste: a quarter of it, and a third of the mean slope)
 DENSITY_SPREAD, DENSITY_CHANGE, SLOPE_CHANGE = 2.0, 0.5, 0.3
 #: step of the finite difference over a share of the memory
 STEP = 1e-3

@@ -43,8 +43,7 @@ POWERS = 3
 LANES = 8
 #: largest negative density that counts as rounding, as a share of the largest density
 ROUNDING = 1e-9
-#: threshold, as a share of the span, below which a play counts as a line: no converter makes so
-#: small a step
+#: threshold [spans] below which a play counts as a line: no converter makes so small a step
 LINE = 1e-9
 
 
@@ -351,9 +350,8 @@ class Hysteresis:
         """
         Compute w for the next inputs, shape (n,), and the memory after them.
 
-        The memory holds the play outputs, shape (m,), and behind them the lags along the path and
-        the last input.  Missing lags begin as `settled` at the first input.  A missing last input
-        is taken from the first input.
+        The memory holds the play outputs, shape (m,), the lags along the path and the last input.
+        Missing lags begin as `settled` at the first input, which replaces a missing last input.
         """
         x, m = np.ascontiguousarray(v), self.thresholds.size
         out, end = np.empty(x.size), np.zeros(self.for_kernel[0].size)
