@@ -175,7 +175,7 @@ def _feedforward(
     Q = whole = linear_inverse(replace(model, effects=rest))
     if preview is not None:
         Q = Q.shortened(preview)
-    # an effect that reads the command passes it on before it is known
+    # an effect that reads the command cannot be inverted, as the command is not known yet
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
     inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept

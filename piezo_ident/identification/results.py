@@ -202,7 +202,7 @@ class Steps:
     dynamics: tuple[DynamicsResult, Dynamics] | None = None
 
     def beside(self, delay: int | None) -> Steps:
-        """Keep these results if they agree with the given delay; else drop all of them."""
+        """Keep these results, unless another delay was given for them or is given now."""
         before = self.delay
         was_given = before is not None and before.source == 'given'
         is_same = before is not None and before.samples == delay

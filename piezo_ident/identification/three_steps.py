@@ -84,7 +84,7 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
     """
     Find the delay from the steps, or without steps from a scan of the ARX loss over the noise.
 
-    A free run over the noise decides if steps and scan differ, or if both fail.  Raises
+    A free run over the noise decides if steps and scan differ, or if the scan fails.  Raises
     IdentificationError if no method tells the delay.
     """
     progress('delay', 0.0)
