@@ -13,11 +13,13 @@ promising ones are fitted together with everything else.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from threading import Event
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
 from piezo_ident.diagnosis.fit_steps import BaseColumns
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes
@@ -25,7 +27,6 @@ from piezo_ident.diagnosis.polishing import good_enough, least_gain, POLISHING
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.starts import Failure, fit_starts
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import (
     best_trials,
@@ -52,6 +53,11 @@ STARTS, FIRST, FINAL = 2, 3, 2
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: ratio to what the last of those leaves up to which another one is fitted to the end, too
 LEVEL = 1.05
+
+#: what fails one start, and leaves the others going
+Failure = ModelError | IdentificationError
+#: how often a caller is asked whether to go on [s]
+ASKED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +254,58 @@ def _contenders(
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
+
+
+def fit_starts(
+    simulator: Simulator,
+    states: Sequence[State],
+    fit: Callable[[Simulator, State, Callable[[], None]], Fitted],
+    tick: Callable[[], None],
+) -> list[Fitted | Failure]:
+    """
+    Return what a fit makes of each state, side by side, or why it failed.
+
+    The fit is given a simulator that no other fit uses, a state, and what it has to call between
+    its steps.  `tick` is called meanwhile, by this thread alone, and may raise `Cancelled`.
+    """
+    copies = simulator.copies(len(states))
+    stopped = Event()
+
+    def alive() -> None:
+        if stopped.is_set():
+            raise Cancelled('another fit was stopped')
+
+    def share(k: int) -> list[Fitted | Failure]:
+        found = list[Fitted | Failure]()
+        for state in states[k :: len(copies)]:
+            try:
+                found.append(fit(copies[k], state, alive))
+            except (ModelError, IdentificationError) as error:
+                found.append(error)
+            except BaseException:
+                stopped.set()
+                raise
+        return found
+
+    with ThreadPoolExecutor(len(copies)) as pool:
+        futures = [pool.submit(share, k) for k in range(len(copies))]
+        try:
+            tick()
+            while wait(futures, ASKED).not_done:
+                tick()
+        except BaseException:
+            stopped.set()
+            raise
+        finally:
+            wait(futures)
+            for copy in copies[1:]:
+                copy.forget()
+    # the one that stopped the others says why
+    errors = [future.exception() for future in futures]
+    for error in sorted(filter(None, errors), key=lambda error: isinstance(error, Cancelled)):
+        raise error
+    shares = [future.result() for future in futures]
+    return [shares[i % len(copies)][i // len(copies)] for i in range(len(states))]
 
 
 def _begun(

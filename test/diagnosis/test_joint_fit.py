@@ -15,8 +15,8 @@ from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, 
 from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly
 from piezo_ident.diagnosis.refits import base_thresholds
 from piezo_ident.diagnosis.rows import make_rows
+from piezo_ident.diagnosis.search import fit_starts
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.starts import fit_starts
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.effects import find_effect
 from piezo_ident.model.simulated_stage import SimulatedStage
