@@ -11,7 +11,6 @@ from typing import overload
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
-from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import diagnose as diagnose_axis
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.identification.identify import identify as identify_axis
@@ -90,21 +89,26 @@ def identify(
     True
     """
     records, validation = (records_of(x, 'identify') for x in (records, validation))
-    axes = axes_of([*records, *validation])
-    if len(axes) == 1:
-        return identify_axis(
+    of_axes = {
+        axis: [part for record in records for part in _moved(record, axis)]
+        for axis in axes_of([*records, *validation])
+    }
+    still = tuple(
+        f'{voltage_of(axis)} never moves; axis {axis} is not identified'
+        for axis, parts in of_axes.items()
+        if not parts
+    )
+    if len(of_axes) == 1 or not any(of_axes[axis] for axis in of_axes if axis != 'y'):
+        one = identify_axis(
             records, settings, validation=validation, progress=progress, steps=steps
         )
+        return replace(one, warnings=(*one.warnings, *still))
     found = {}
-    for axis in axes:
-        parts = [part for r in records for part in _moved(r, axis)]
-        if not parts:
-            raise IdentificationError(
-                f'{voltage_of(axis)} never moves; record axis {axis} while it is driven'
-            )
-        unseen = [axis_record(r, axis) for r in validation]
-        told = _named(progress, axis)
-        found[axis] = identify_axis(parts, settings, validation=unseen, progress=told)
+    for axis, parts in of_axes.items():
+        if parts:
+            unseen, told = [axis_record(r, axis) for r in validation], _named(progress, axis)
+            one = identify_axis(parts, settings, validation=unseen, progress=told)
+            found[axis] = replace(one, warnings=(*one.warnings, *still))
     return EachAxis(found)
 
 

@@ -74,6 +74,16 @@ def test_each_path_is_named_with_its_source_and_has_its_size(diagnosed):
         assert gain == pytest.approx(share, rel=0.02)
 
 
+def test_an_axis_that_never_moves_is_left_out_and_told():
+    v = sweeps(1500, np.random.default_rng(4))
+    first = pi.identify(play(v, np.zeros(1500)), FEW)
+    assert isinstance(first, pi.Identification)
+    assert any('y_b is not identified' in x for x in first.warnings)
+    other = pi.identify(play(np.zeros(1500), v), FEW)
+    assert list(other) == ['y_b']
+    assert any('axis y is not identified' in x for x in other['y_b'].warnings)
+
+
 def test_axes_of_a_raster_are_identified():
     result = pi.identify(play(*raster(2500)), FEW)
     for axis in ('y', 'y_b'):
