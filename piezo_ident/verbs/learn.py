@@ -29,6 +29,7 @@ from piezo_ident.model.multi_axis import (
     voltage_of,
 )
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
 
 #: share of the range of a voltage below which it rests
@@ -207,16 +208,19 @@ def _moved(record: Record, axis: str) -> list[Record]:
     """Return a record as an axis sees it, without long rests in which only others move."""
     seen = axis_record(record, axis)
     pieces: list[Piece] = []
+    moves = False
     for piece, whole in zip(seen, record, strict=True):
-        others = {k: x for k, x in {'v': whole.v, **whole.channels}.items() if k[:1] == 'v'}
+        others = {k: x for k, x in whole.channels.items() if role_of(k) == 'v'} | {'v': whole.v}
         del others[voltage_of(axis)]
         span = max(float(np.ptp(x)) for x in (piece.v, *others.values()))
         size = max(2, round(BLOCK * piece.sample_rate))
         still = np.all([_rests(x, span, size) for x in others.values()], axis=0)
-        runs = true_runs(_rests(piece.v, span, size) & ~still)
+        rests = _rests(piece.v, span, size)
+        moves |= not rests.all()
+        runs = true_runs(rests & ~still)
         long = [(a * size, b * size) for a, b in runs if (b - a) * size > LONG * piece.sample_rate]
         pieces += piece.without((a, min(b, piece.n)) for a, b in long)
-    return [replace(seen, pieces=tuple(pieces))] if pieces else []
+    return [replace(seen, pieces=tuple(pieces))] if moves else []
 
 
 def _rests(v: Array, span: float, size: int) -> Mask:
