@@ -104,8 +104,7 @@ wanted motion, on the middle {middle:g} % of each line.
 
 {table}
 
-`pi.identify` took {identify:.0f} s and `pi.diagnose` {diagnose:.0f} s here, `pi.invert`
-{invert:.1f} s for {length:g} s of raster.
+`pi.invert` took {invert:.1f} s for {length:g} s of raster.
 """
 
 
@@ -288,33 +287,27 @@ def picture(rows: list[Row]) -> Figure:
 
 @dataclass(frozen=True, eq=False)
 class Taught:
-    """What one record taught: the model, a row of the table for each axis, and times [s]."""
+    """What one record taught: the model, a row of the table for each axis, and lengths [s]."""
 
     model: pi.MultiAxisModel
     found: list[str]
     length: float
     alone: float
-    identify: float
-    diagnose: float
 
 
 def teach() -> Taught:
     """Identify and diagnose the scanner."""
     v, labels, start = learning()
     piece = measured(v, np.random.default_rng(0), labels, 'scanner').pieces[0]
-    begun = time.perf_counter()
     identified = pi.identify(Record((piece.cut(0, start),), 'one by one'))
-    between = time.perf_counter()
     diagnosis = pi.diagnose(identified.model, Record((piece.cut(start, piece.n),), 'both'))
-    end = time.perf_counter()
     print(identified, diagnosis, sep='\n\n')
     found = [
         f'| {NAMES[axis]} | {x.verdict}: {", ".join(e.name for e in x.effects) or "nothing"} | '
         f'{x.before.overall:.2f}, {x.after.overall:.2f} |'
         for axis, x in diagnosis.items()
     ]
-    model = diagnosis.model
-    return Taught(model, found, piece.duration, start / RATE, between - begun, end - between)
+    return Taught(diagnosis.model, found, piece.duration, start / RATE)
 
 
 def write(taught: Taught, out: Path, drawn: Path | None) -> None:
@@ -338,8 +331,6 @@ def write(taught: Taught, out: Path, drawn: Path | None) -> None:
         'formula': FORMULA,
         'found': '\n'.join(taught.found),
         'table': head + '\n'.join(row.cells() for row in rows),
-        'identify': taught.identify,
-        'diagnose': taught.diagnose,
         'invert': results[0][1],
     }
     out.write_text(TEXT.format(**page))

@@ -53,7 +53,9 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     if not isinstance(model, MultiAxisModel):
         return export_axis(model, name, **options)
     tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
-    sources = [a for a in model.axes if any(motion_of(a) in paths(x) for x in model.axes.values())]
+    sources = [
+        a for a in model.axes if any(motion_of(a) in channels_of(x) for x in model.axes.values())
+    ]
     texts = [
         export_axis(model.own(axis), f'{tags[axis]}_own', feedforward=False) for axis in sources
     ]
@@ -61,8 +63,8 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     return '\n'.join([*texts, _stage(model, name, tags, sources)])
 
 
-def paths(model: StageModel) -> list[str]:
-    """Return the motions of other axes among the channels of a model, in the order of its C."""
+def channels_of(model: StageModel) -> list[str]:
+    """Return the further channels of a model in the order of its C."""
     links = [link for part in links_of(model) for link in part.links]
     return LinkGroup(links).channels
 
@@ -79,7 +81,7 @@ def _stage(model: MultiAxisModel, name: str, tags: dict[str, str], sources: list
         i = order.index(a)
         step.append(f'    const double own_{a} = {tags[a]}_own_step(&s->own_{a}, v[{i}]);')
     for i, (axis, x) in enumerate(model.axes.items()):
-        for k, channel in enumerate(paths(x)):
+        for k, channel in enumerate(channels_of(x)):
             if channel.startswith(MOTION):
                 step.append(f'    s->{axis}.channel[{k}] = own_y{channel[len(MOTION) :]};')
             else:

@@ -11,7 +11,6 @@ from typing import overload
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
-from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis import diagnose as diagnose_axis
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.identification.identify import identify as identify_axis
@@ -30,6 +29,7 @@ from piezo_ident.model.multi_axis import (
     voltage_of,
 )
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
 
 #: share of the range of a voltage below which it rests
@@ -90,21 +90,26 @@ def identify(
     True
     """
     records, validation = (records_of(x, 'identify') for x in (records, validation))
-    axes = axes_of([*records, *validation])
-    if len(axes) == 1:
-        return identify_axis(
+    of_axes = {
+        axis: [part for record in records for part in _moved(record, axis)]
+        for axis in axes_of([*records, *validation])
+    }
+    still = tuple(
+        f'{voltage_of(axis)} never moves; axis {axis} is not identified'
+        for axis, parts in of_axes.items()
+        if not parts
+    )
+    if len(of_axes) == 1 or not any(of_axes[axis] for axis in of_axes if axis != 'y'):
+        one = identify_axis(
             records, settings, validation=validation, progress=progress, steps=steps
         )
+        return replace(one, warnings=(*one.warnings, *still))
     found = {}
-    for axis in axes:
-        parts = [part for r in records for part in _moved(r, axis)]
-        if not parts:
-            raise IdentificationError(
-                f'{voltage_of(axis)} never moves; record axis {axis} while it is driven'
-            )
-        unseen = [axis_record(r, axis) for r in validation]
-        told = _named(progress, axis)
-        found[axis] = identify_axis(parts, settings, validation=unseen, progress=told)
+    for axis, parts in of_axes.items():
+        if parts:
+            unseen, told = [axis_record(r, axis) for r in validation], _named(progress, axis)
+            one = identify_axis(parts, settings, validation=unseen, progress=told)
+            found[axis] = replace(one, warnings=(*one.warnings, *still))
     return EachAxis(found)
 
 
@@ -203,16 +208,19 @@ def _moved(record: Record, axis: str) -> list[Record]:
     """Return a record as an axis sees it, without long rests in which only others move."""
     seen = axis_record(record, axis)
     pieces: list[Piece] = []
+    moves = False
     for piece, whole in zip(seen, record, strict=True):
-        others = {k: x for k, x in {'v': whole.v, **whole.channels}.items() if k[:1] == 'v'}
+        others = {k: x for k, x in whole.channels.items() if role_of(k) == 'v'} | {'v': whole.v}
         del others[voltage_of(axis)]
         span = max(float(np.ptp(x)) for x in (piece.v, *others.values()))
         size = max(2, round(BLOCK * piece.sample_rate))
         still = np.all([_rests(x, span, size) for x in others.values()], axis=0)
-        runs = true_runs(_rests(piece.v, span, size) & ~still)
+        rests = _rests(piece.v, span, size)
+        moves |= not rests.all()
+        runs = true_runs(rests & ~still)
         long = [(a * size, b * size) for a, b in runs if (b - a) * size > LONG * piece.sample_rate]
         pieces += piece.without((a, min(b, piece.n)) for a, b in long)
-    return [replace(seen, pieces=tuple(pieces))] if pieces else []
+    return [replace(seen, pieces=tuple(pieces))] if moves else []
 
 
 def _rests(v: Array, span: float, size: int) -> Mask:
