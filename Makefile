@@ -17,7 +17,7 @@ MADE := .venv/.made$(if $(SOURCED),-sourced)
 
 .PHONY: any-record attack docs netns soak
 .PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
-.PHONY: crash limits mirror study study-xy table-one clean distclean
+.PHONY: crash limits mirror stays-right study study-xy table-one clean distclean
 .DELETE_ON_ERROR:
 
 demo: .venv/.demo
@@ -114,6 +114,11 @@ soak: .venv/.test
 # unlabelled records of seventeen kinds beside four simple peers, about an hour
 any-record: .venv/.demo
 	.venv/bin/python benchmarks/any_record.py docs/any_record.md
+
+# what the live model makes of stages that change while they scan: some minutes
+stays-right: .venv/.demo
+	.venv/bin/python benchmarks/stays_right.py docs/stays_right.md \
+	    --picture docs/images/stays_right.png
 
 # Table I of the paper with a third row: about a minute
 table-one: .venv/.demo

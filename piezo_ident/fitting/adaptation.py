@@ -49,13 +49,13 @@ Recalled: TypeAlias = Callable[[StageModel], Stream]
 #: time over which samples are averaged to one measurement [s]
 GROUP = 2e-3
 #: time constant of the high-pass [s]: below it lie scans, above it drift and slow creep (taste)
-SLOW = 0.3
+SLOW = 0.1
 #: time of motion after which what was measured counts by 1 / e [s]: five of them are the 10 s in
 #: which a change is to be learnt, with a spare
 MEMORY = 1.5
 #: time for which what is not believed must last until it is [s]: the high-pass has forgotten a
 #: step of the sensor by then
-PATIENCE = 4.0 * SLOW
+PATIENCE = 6.0 * SLOW
 #: hats over the thresholds (taste: as many as the wider laws of H have)
 HATS = 5
 #: rms size of what is learnt: of weights, of the cubic in normalised units, of the shares of creep
@@ -67,8 +67,8 @@ LARGEST = 3.0
 LEFT = 0.1
 #: places over the span at which the slope is watched
 PLACES = 9
-#: size of a drift, as what it leaves behind the high-pass, in spans: a micrometre a second of a
-#: span of 100 um, the first seconds of a stage that was switched on (taste)
+#: size of a drift, as what it leaves behind the high-pass, in spans: creep of a hundredth a
+#: decade, half a second after a step over the range
 DRIFT = SLOW * 1e-2
 
 
@@ -189,7 +189,7 @@ class Adaptation:
         self._runs = [recalled(change.model) for change in self._changes]
         self._past = np.full((n, self.horizon), np.nan)
         self._slow, self._sums = np.full(n, np.nan), np.zeros(n)
-        self._now[[kernel.COUNT, kernel.FINITE, kernel.REFUSED]] = 0.0
+        self._now[[kernel.COUNT, kernel.FINITE, kernel.REFUSED, kernel.PIVOT]] = 0.0
 
     @property
     def seconds(self) -> float:

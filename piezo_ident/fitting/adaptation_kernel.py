@@ -15,8 +15,9 @@ TELLS = 1e-2
 RARE = 0.1
 
 # places of the numbers in `now`: samples and finite ones of the group, measurements that are not
-# believed, scale of the variance, and measurements that were learnt from
-COUNT, FINITE, REFUSED, SCALE, LEARNT, PLACES = range(6)
+# believed, scale of the variance, measurements that were learnt from, and what the changes add
+# where the stage is on average
+COUNT, FINITE, REFUSED, SCALE, LEARNT, PIVOT, PLACES = range(7)
 # places in `law`: variance, what the high-pass keeps, what is not forgotten, groups of patience,
 # and gate
 ERROR, KEEP, KEPT, PATIENCE, GATE = range(5)
@@ -107,6 +108,8 @@ def _take(
         # another stage: as little is known of it as at first
         information[:, :] = prior
         now[REFUSED] = 0.0
+        # or one that the model lacks something of, which then counts as error
+        now[SCALE] *= 2.0
     else:
         now[REFUSED] = max(0.0, now[REFUSED] - RARE)
         # slowly, or a step would count as such an error
@@ -166,10 +169,14 @@ def learn(
                 mean = sums / group
                 f = np.ones(n + 1)
                 f[:n] = mean[:n]
+                old = theta.copy()
                 _take(mean[n], f, law, prior, halves, theta, information, now)
+                # what is learnt turns the motion about its middle: a zero is for the observer
+                for i in range(n):
+                    now[PIVOT] += (theta[i] - old[i]) * slow[i]
             sums[:] = 0.0
             now[COUNT] = now[FINITE] = 0.0
-        add = 0.0
+        add = -now[PIVOT]
         for i in range(n):
             add += theta[i] * new[1 + i, k]
         out[k] = add
