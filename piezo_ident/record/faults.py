@@ -63,9 +63,8 @@ def without_faults(record: Record) -> Record:
     Return a record whose masks leave out the readings that cannot be the stage's.
 
     A straight line stands in for them, and for the voltage of a row that was lost as a whole.
-    Of the displacement of another axis, a channel, they become NaN.  What is found is counted in
-    the faults of the record.  Where nothing is, or where the masks were decided before, the same
-    record is returned.
+    In a channel with the displacement of another axis they become NaN.  The faults of the record
+    count them.  The same record comes back without any, or when its masks were decided before.
     """
     if any(piece.sound is not None for piece in record):
         return record
