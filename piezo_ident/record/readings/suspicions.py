@@ -15,7 +15,7 @@ import difflib
 
 import numpy as np
 from piezo_ident.common.arrays import true_runs
-from piezo_ident.record.faults import constant, end_of_rest, MOVED, period_of
+from piezo_ident.record.readings.faults import constant, end_of_rest, MOVED, period_of
 from piezo_ident.record.record import KINDS, Piece, Record
 
 #: share of the voltage's range within which it rests where it began

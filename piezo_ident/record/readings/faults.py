@@ -19,8 +19,17 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
 from piezo_ident.record.channels import role_of
-from piezo_ident.record.jumps import AROUND, CODES, FAR, JUMP, Jumps, LEAST, least_jump, RINGS
 from piezo_ident.record.ordering import at_times
+from piezo_ident.record.readings.jumps import (
+    AROUND,
+    CODES,
+    FAR,
+    JUMP,
+    Jumps,
+    LEAST,
+    least_jump,
+    RINGS,
+)
 from piezo_ident.record.record import Fault, Piece, Record
 
 Runs = list[tuple[int, int]]
