@@ -34,7 +34,7 @@ from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
 from piezo_ident.common.errors import DataError
 from piezo_ident.identification.prepare import fault_lines
 from piezo_ident.record.channels import Axes
-from piezo_ident.record.faults import without_faults
+from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 
 #: most periods of one segment
@@ -75,7 +75,7 @@ def periods_of(records: Sequence[Record]) -> Periods:
     Find the periodic segments of some records of one stage.
 
     Of three periods or more the first is left out: the stage settles in it.  Readings that cannot
-    be the stage's are left out of all that is made of them (`piezo_ident.record.faults`).
+    be the stage's are left out of all that is made of them (`piezo_ident.record.readings.faults`).
 
     Raises
     ------

@@ -233,6 +233,14 @@ cli = Verbs(
 click.version_option(__version__, message='piezo_ident %(version)s')(cli)
 
 
+def _told(error: click.UsageError) -> str:
+    text = error.format_message()
+    if isinstance(error, click.NoSuchOption):
+        guess = _guess(error.option_name, error.possibilities or ())
+        text = f'no such option: {error.option_name}{guess and "; "}{guess}'
+    return f'{text} (see {error.ctx.command_path if error.ctx else "piezo_ident"} --help)'
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, with the arguments of the process by default, and return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -276,14 +284,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # the reader has read enough; the interpreter's own flush must not complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except click.UsageError as error:
-        text, place = (
-            error.format_message(),
-            error.ctx.command_path if error.ctx else 'piezo_ident',
-        )
-        if isinstance(error, click.NoSuchOption):
-            guess = _guess(error.option_name, error.possibilities or ())
-            text = f'no such option: {error.option_name}{guess and "; "}{guess}'
-        return stop(BAD_INPUT, f'{text} (see {place} --help)', 'UsageError')
+        return stop(BAD_INPUT, _told(error), 'UsageError')
     except PiezoIdentError as error:
         text = str(error)
         if error.options:

@@ -31,7 +31,7 @@ class PiezoIdentError(Exception):
     ----------
     message : str
     options : str
-        What to add to the command line, as it is typed, where that mends it.
+        Options to add to the command line, as they are typed, where these mend it.
     """
 
     def __init__(self, message: str = '', *, options: str = '') -> None:
@@ -101,7 +101,7 @@ def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) 
     Raises
     ------
     DataError
-        With what is expected, what came instead, and what to do.
+        Names the expected type, the type of the argument, and the cure.
     """
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)

@@ -39,7 +39,7 @@ _MERGE_KEY = re.compile(r'(^|[{,])\s*<<\s*:', re.MULTILINE)
 
 
 def broken_link(path: str | os.PathLike[str]) -> str | None:
-    """Return what is wrong with a symbolic link that leads nowhere, else None."""
+    """Return the fault of a symbolic link that leads nowhere, else None."""
     if os.path.islink(path) and not os.path.exists(path):
         return f'is a link to {os.readlink(path)}, which cannot be reached; mend the link'
     return None

@@ -94,10 +94,10 @@ def alive(x: float) -> float:
     """
     Return x, or zero when it has died away.
 
-    For the state of a filter: where its input rests, it falls until the digits of a number run
-    out, and from there on each operation takes a processor a hundred times as long.
+    The state of a filter whose input rests falls to subnormal numbers, which take a processor a
+    hundred times as long.
 
-    It is compiled into each loop that calls it, and loops are kept on disk until their own file
-    changes: after a change of it their caches have to be emptied.
+    This function is compiled into each loop that calls it.  Loops are cached until their own file
+    changes, so the caches have to be emptied when this function changes.
     """
     return 0.0 if abs(x) < STILL else x

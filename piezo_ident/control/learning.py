@@ -31,8 +31,8 @@ from piezo_ident.control.inverse import FAR, Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.faults import MAX_WILD
-from piezo_ident.record.jumps import least_step, wild_readings
+from piezo_ident.record.readings.faults import MAX_WILD
+from piezo_ident.record.readings.jumps import least_step, wild_readings
 
 #: learning goes on while a run leaves at most this share of the error
 WORTH = 0.95

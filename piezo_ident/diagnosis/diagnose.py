@@ -55,10 +55,10 @@ from piezo_ident.identification.prepare import filled_in, same_rate
 from piezo_ident.identification.results import Progress, silent
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.faults import without_faults
-from piezo_ident.record.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.faults import without_faults
+from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.suspicions import suspicions
 from piezo_ident.record.record import Record, records_of
-from piezo_ident.record.suspicions import suspicions
 from piezo_ident.residual import (
     all_stretches,
     channel_tests,

@@ -27,7 +27,7 @@ from piezo_ident.model.metrics import percent, strokes
 from piezo_ident.model.sines import sine_frequency
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.play import initial_memory
-from piezo_ident.record.gaps import FEW
+from piezo_ident.record.readings.gaps import FEW
 from piezo_ident.record.record import Record
 from piezo_ident.residual.stretches import block_means
 

@@ -19,7 +19,7 @@ from piezo_ident.model.initial_memory import early_part, fit_start
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
-from piezo_ident.record.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart

@@ -33,7 +33,7 @@ from piezo_ident.identification.step3_hysteresis import (
 )
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.record.suspicions import rises_first
+from piezo_ident.record.readings.suspicions import rises_first
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 #: most samples of records that the search simulates as a whole, most samples of the windows that

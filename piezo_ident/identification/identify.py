@@ -75,7 +75,7 @@ from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
-from piezo_ident.record.faults import without_faults
+from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 from scipy import __version__ as scipy_version
 

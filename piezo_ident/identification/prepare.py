@@ -17,11 +17,11 @@ from piezo_ident.model.initial_memory import forgotten
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
-from piezo_ident.record.faults import without_faults
-from piezo_ident.record.gaps import bridged, FEW
-from piezo_ident.record.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.faults import without_faults
+from piezo_ident.record.readings.gaps import bridged, FEW
+from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.suspicions import rises_first, suspicions
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.suspicions import rises_first, suspicions
 
 #: number of blocks into which a triangle is cut; one in `EVERY` is held out
 BLOCKS, EVERY = 60, 5

@@ -23,8 +23,8 @@ from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
+from piezo_ident.record.readings.suspicions import line_error, misspelt
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.suspicions import line_error, misspelt
 
 #: change of G within the excited band below which the band is too narrow to know G
 HARDLY = 0.1

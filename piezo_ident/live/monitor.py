@@ -16,8 +16,8 @@ from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.observer import PATH
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.faults import MAX_WILD
-from piezo_ident.record.jumps import AROUND, least_step, wild_readings
+from piezo_ident.record.readings.faults import MAX_WILD
+from piezo_ident.record.readings.jumps import AROUND, least_step, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0

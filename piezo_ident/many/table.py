@@ -16,7 +16,7 @@ from typing import Any
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.many.figures_of_merit import figures_of_merit
-from piezo_ident.record.faults import without_faults
+from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
 
 #: content of a cell

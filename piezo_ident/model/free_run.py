@@ -22,9 +22,9 @@ from piezo_ident.model.initial_memory import crept, EARLY, early_part, fit_start
 from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
-from piezo_ident.record.faults import without_faults
-from piezo_ident.record.gaps import bridged, connected_pieces
-from piezo_ident.record.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.faults import without_faults
+from piezo_ident.record.readings.gaps import bridged, connected_pieces
+from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Piece, Record
 
 
@@ -240,8 +240,8 @@ def run_pieces(model: StageModel, pieces: Sequence[Piece], start: StartLike) -> 
     """
     Predict the displacement [m] of pieces that follow each other over short gaps.
 
-    `piezo_ident.record.gaps.connected_pieces` gives such pieces.  `start` is the start of the
-    first piece, as in `StageModel.simulate`.
+    `piezo_ident.record.readings.gaps.connected_pieces` gives such pieces.  `start` is the start of
+    the first piece, as in `StageModel.simulate`.
     """
     stream = model.stream(start)
     predicted = [stream.follow(pieces[0])]

@@ -30,9 +30,9 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.record.gaps import connected_pieces
+from piezo_ident.record.readings.gaps import connected_pieces
+from piezo_ident.record.readings.suspicions import rises_first
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.suspicions import rises_first
 from scipy.optimize import lsq_linear
 
 #: share of its range that the voltage must sweep until the start is forgotten
@@ -183,7 +183,7 @@ def fit_start(
     ----------
     model : StageModel
     piece : Piece
-        With short gaps bridged, as of `piezo_ident.record.gaps.bridged`.
+        With short gaps bridged, as of `piezo_ident.record.readings.gaps.bridged`.
     sound : ndarray of bool, shape (n,), optional
         Its samples that were measured; all when absent.
 

@@ -16,7 +16,7 @@ from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import cascade, STRETCH
-from piezo_ident.record.gaps import follows, played_before
+from piezo_ident.record.readings.gaps import follows, played_before
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:

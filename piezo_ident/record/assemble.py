@@ -93,7 +93,7 @@ def assemble(
     channels : mapping of str to array_like, shape (n,), optional
         Further signals; ``v_<name>`` and ``y_<name>`` are another axis.
     name : str
-        What errors call the data, and the record's name.
+        Name of the record, also in errors.
     options : ReadOptions, optional
         Unit of `y`, and limits of `v`; they hold for further axes too.
     sample_rate : float, optional

@@ -28,8 +28,8 @@ from piezo_ident.record.record import Segment
 
 #: samples in a block by default
 BLOCK_SIZE = 100
-#: labels of what a driver applies by itself: the last voltage in a gap of the command, and a ramp
-#: to rest where no command comes
+#: labels of voltages that a driver applies without a command: the last voltage during a gap, and a
+#: ramp to rest when no command comes
 HELD, RAMPED = 'hold:gap', 'ramp:silence'
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5

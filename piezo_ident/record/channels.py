@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a stage of several axes adds to a record, and under which name each format carries it.
+Channels of a stage with several axes, and their names in each format.
 
 The first axis is ``v`` and ``y``, as of any stage.  The voltage and the displacement of another
 one are the channels ``v_<name>`` and ``y_<name>``; whatever looks at one axis takes them for

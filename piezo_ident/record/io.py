@@ -148,26 +148,25 @@ def _factor(table: RecordTable, role: str) -> float:
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
     """Yield where another unit is likelier than the default, or than that of a header."""
     rates = [piece.sample_rate for piece in record]
-    if table.rate is not None and not SLOW < table.rate <= FAST:
-        kind = 'slow' if table.rate <= SLOW else 'fast'
-        where = f'sampled at {table.rate:.6g} Hz, unusual for a stage'
-        # one that the file names may be counted in another unit
-        other = f'{table.rate * (1e3 if kind == "slow" else 1e-3):.9g}'
-        way = f'--rate {other if options.rate is None else "20e3"}'
-        yield Fault(f'{kind}_sampling', where, 1, f'is it in Hz? else give it as in {way}')
-    elif table.rate is None and options.time_unit is None:
-        unit = table.units.get('t', 's')
-        finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
-        for kind, rate, is_odd, other in (
-            ('slow', min(rates), min(rates) <= SLOW, finer),
-            ('fast', max(rates), max(rates) > FAST, '' if unit == 's' else 's'),
-        ):
-            if is_odd:
-                where = f'sampled at {rate:.6g} Hz with t in {unit}, unusual for a stage'
-                # a unit without a number must not contradict the header
-                other = f'1{other}' if other and 't' in table.units else other
-                cure = 'is the time unit right?' + (other and f' else add --time-unit {other}')
-                yield Fault(f'{kind}_sampling', where, 1, cure)
+    slow, fast = ('slow', min(rates)), ('fast', max(rates))
+    for kind, rate in [slow] * (slow[1] <= SLOW) + [fast] * (fast[1] > FAST):
+        where = f'sampled at {rate:.6g} Hz'
+        if table.rate is not None:
+            # one that the file names may be counted in another unit
+            other = f'{rate * (1e3 if kind == "slow" else 1e-3):.9g}'
+            way = f'--rate {other if options.rate is None else "20e3"}'
+            cure = f'is it in Hz? else give it as in {way}'
+        elif options.time_unit is None:
+            unit = table.units.get('t', 's')
+            finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
+            other = finer if kind == 'slow' else 's' * (unit != 's')
+            # a unit without a number must not contradict the header
+            other = f'1{other}' if other and 't' in table.units else other
+            where += f' with t in {unit}'
+            cure = 'is the time unit right?' + (other and f' else add --time-unit {other}')
+        else:
+            continue
+        yield Fault(f'{kind}_sampling', f'{where}, unusual for a stage', 1, cure)
     if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:
         where = f'a stroke of {1e3 * record.stroke:.3g} mm with y in metres'
         cure = 'if y counts micrometres, add --displacement-unit um'

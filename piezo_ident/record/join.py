@@ -5,9 +5,9 @@
 A record from streams of blocks, whether they come live or from a bag.
 
 Voltage and displacement meet on equal time stamps.  Blocks may be lost, come twice, or start over
-with a restarted clock, and the streams need not be cut into the same blocks.  Where a time stamp
-occurs more than once, the first of one stream belongs to the first of the other; after a loss, the
-two that arrived closest to each other do.
+with a restarted clock, and the streams need not be cut into the same blocks.  Equal time stamps in
+one stream are matched in turn with those of the other; after a loss, the two that arrived closest
+to each other belong together.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def record_of_streams(
         command, so these samples are cut out.  A further axis or channel that lacks more than
         `MAX_MISSING` of the samples is left out.
     name : str
-        What errors call the data, and the record's name.
+        Name of the record, also in errors.
     options, sample_rate, faults
         As for `piezo_ident.record.assemble.assemble`.
 

@@ -97,7 +97,7 @@ class Piece:
         The samples right before, of which everything but the displacement is known.
     sound : array_like of bool, shape (n,), optional
         False where a reading was no displacement of the stage, and a straight line stands in for
-        it; see `piezo_ident.record.faults.without_faults`.  None before that was judged.
+        it; see `piezo_ident.record.readings.faults.without_faults`.  None before that was judged.
 
     Raises
     ------

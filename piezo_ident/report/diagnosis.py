@@ -287,7 +287,7 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     if most is not None and n > most:
         title, rows = f'{title}, the first {most} of {n}', rows[:most]
     note = (
-        'Share that each takes, added alone, of what the hysteresis that fits best leaves without.'
+        'Share of the error left by the best hysteresis that each candidate removes, added alone.'
     )
     return table(title, ('effect', 'share', 'why not'), rows, note)
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -84,12 +85,10 @@ def _detrended(x: Array, linear: bool) -> Array:
 
 def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
     """Return the parts of the rate at which most was sampled."""
-    rates: dict[float, int] = {}
+    rates: Counter[float] = Counter()
     for part in parts:
-        rates[part.piece.sample_rate] = rates.get(part.piece.sample_rate, 0) + part.piece.n
-    if not rates:
-        return [], 1.0
-    rate = max(rates, key=lambda r: rates[r])
+        rates[part.piece.sample_rate] += part.piece.n
+    rate = max(rates, key=rates.__getitem__, default=1.0)
     return [p for p in parts if abs(p.piece.sample_rate / rate - 1.0) < 1e-6], rate
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
-from piezo_ident.record.faults import end_of_rest, MOVED, quantum_of, STUCK, white_noise
+from piezo_ident.record.readings.faults import end_of_rest, MOVED, quantum_of, STUCK, white_noise
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
@@ -53,7 +53,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     """
     Look for outliers, clipping, coarse steps, jitter and knocks: one fault for each part and kind.
 
-    `piezo_ident.record.faults` has left out the faults that the readings alone show.
+    `piezo_ident.record.readings.faults` has left out the faults that the readings alone show.
     """
     faults: list[Fault] = []
     found: list[Mask] = []

@@ -12,7 +12,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, closed, interpolated, Mask, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.model.metrics import strokes
-from piezo_ident.record.gaps import FEW
+from piezo_ident.record.readings.gaps import FEW
 from piezo_ident.record.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d, uniform_filter1d

@@ -42,8 +42,8 @@ from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.record.readings.suspicions import suspicions
 from piezo_ident.record.record import Piece, Record, Segment
-from piezo_ident.record.suspicions import suspicions
 from programs import identification_program, SLOW, slow_model
 import pytest
 import truths

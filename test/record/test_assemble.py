@@ -51,6 +51,12 @@ def test_clean_columns_come_back_as_they_are():
     np.testing.assert_array_equal(piece.y, y)
 
 
+@pytest.mark.parametrize('column', [1, 2])
+def test_an_offset_of_some_strokes_does_no_harm(column):
+    c = columns()
+    assert sizes(read(changed(slice(None), column, 100 * np.ptp(c[column]), c))) == [200]
+
+
 def test_inputs_stay_as_they_are():
     c = rows(columns(50), columns(50, start=60))
     c[1][7] = np.nan
@@ -61,7 +67,7 @@ def test_inputs_stay_as_they_are():
         np.testing.assert_array_equal(x, y)
 
 
-def changed(row: int, column: int, by: float, c: list[np.ndarray]) -> list[np.ndarray]:
+def changed(row: int | slice, column: int, by: float, c: list[np.ndarray]) -> list[np.ndarray]:
     c[column][row] += by
     return c
 
@@ -289,6 +295,12 @@ def scaled(*by: float) -> list[np.ndarray]:
         ),
         *((scaled(1, 1, f), '--displacement-unit') for f in (1e6, 1e-6)),
         *((scaled(f, 1, 1), 'write t in seconds') for f in (1e15, 1e-9)),
+        *((scaled(1, f, 1), 'no voltage') for f in (1e-320, 1e13)),
+        *((scaled(1, 1, f), 'no piezo stage') for f in (1e-314, 1e305)),
+        *(
+            (changed(slice(None), k, 1e11 * size, columns()), f'{"tvy"[k]} lies at')
+            for k, size in ((1, 10.0), (2, 75e-6))
+        ),
         (
             [np.sort(np.random.default_rng(1).uniform(size=200)), *columns()[1:]],
             'not uniformly sampled',

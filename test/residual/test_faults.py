@@ -8,7 +8,7 @@ import re
 import numpy as np
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.record.faults import quantum_of
+from piezo_ident.record.readings.faults import quantum_of
 from piezo_ident.record.record import Piece
 from piezo_ident.residual import find_faults, ResidualPart
 import pytest

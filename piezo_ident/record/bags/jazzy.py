@@ -25,7 +25,7 @@ DISTRIBUTION = 'jazzy'
 
 
 class JazzyWriter(Writer):
-    """Writes what rosbag2 of Jazzy writes: its name, and the hash of the type in a channel."""
+    """Writer of bags with the distribution and the type hashes that rosbag2 of Jazzy writes."""
 
     def open(self) -> None:
         """Open the bag, and put the two additions between it and its storage."""

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags read from the beginning of their files, message by message: those that an index cannot open.
+Bags without an index, read from the beginning of their files, message by message.
 
-An unfinished bag has no metadata.yaml, an mcap file without its end, or an sqlite3 file with the
-journal of a transaction beside it.  Of an mcap file every whole chunk is read; of a database all
-that was committed.  The bag itself is not changed: a journal is applied to a copy, and a file
-that is compressed as a whole is unpacked to one.
+An unfinished bag lacks metadata.yaml or the end of an mcap file, or the journal of a transaction
+lies beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all committed
+rows of a database.  The bag stays as it is: journals are applied to copies, and compressed files
+are unpacked to copies.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rosbags.rosbag2.metadata import parse_qos
 _MAGIC = b'\x89MCAP0\r\n'
 _SIDECARS = ('-journal', '-wal')
 _BAG_FILE = re.compile(r'(?P<name>.+(?P<storage>\.mcap|\.db3))(\.zstd?)?', re.IGNORECASE)
-#: first bytes of what zstd compressed; a message itself begins with a zero
+#: first bytes of zstd data; a message itself begins with a zero
 _ZSTD = b'\x28\xb5\x2f\xfd'
 #: bytes that are unpacked together
 _UNPACKED = 1 << 22
@@ -74,11 +74,11 @@ class Bag:
         The topics, with types, QoS profiles and numbers of messages.
     messages : callable
         Yields the messages of some connections, in the order of their log times where the bag has
-        an index of these, else in that of the files.
+        an index of log times, else in the order of the files.
     start, end : int
         Log times of the first and the last message [ns]; equal for an empty bag.
     faults : tuple of Fault
-        What is wrong with the bag as a whole.
+        Damage of the bag as a whole.
     """
 
     path: Path
@@ -123,7 +123,7 @@ def metadata(folder: Path) -> dict[str, Any]:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Return whether a bag lacks what closing it writes; DataError for a folder without a bag."""
+    """Return whether a bag was never closed; DataError for a folder without a bag."""
     files = _storage_files(path)
     if path.is_dir() and not (path / 'metadata.yaml').is_file():
         return True
@@ -196,7 +196,7 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
     """
     Open a bag whose messages come in the order of its files; `stack` closes it.
 
-    Its faults say what is missing.  DataError when no whole message is in it.
+    The faults name the missing parts.  DataError for a bag without a whole message.
     """
     parts = []
     for packed in _storage_files(path):
@@ -240,7 +240,7 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
 
 
 def unpacked(messages: Iterable[Stored], path: Path) -> Iterator[Stored]:
-    """Yield messages, those that were compressed one by one unpacked and in order again."""
+    """Yield messages; those that were compressed one by one are unpacked and sorted again."""
     held: list[tuple[int, int, Stored]] = []
     for i, message in enumerate(messages):
         if message.raw[:4] != _ZSTD:

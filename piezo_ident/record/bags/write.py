@@ -65,8 +65,8 @@ class BagWriter:
     """
     An open bag, or several one after the other; all calls must come from one thread.
 
-    With a `max_size`, each part is a whole bag with all topics, named as the first one with a
-    number behind it; its custom data say which ``part`` of which ``recording`` it is.
+    With a `max_size` a recording has several parts.  Each part is a whole bag with all topics.
+    The parts are numbered in their names; their custom data hold ``part`` and ``recording``.
 
     Parameters
     ----------

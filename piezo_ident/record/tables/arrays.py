@@ -134,7 +134,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
     # where all end at one sample, nothing but the end is missing
     uneven = len({len(channel) for channel in channels}) > 1
     for name, part in cut.items():
-        # a channel without samples would be taken for one that is not there
+        # a channel without samples would seem to be absent
         if uneven and part.read_length < part.expected_length:
             raise DataError(
                 f'{path}: ends early, {name} has {part.read_length} of {part.expected_length} '

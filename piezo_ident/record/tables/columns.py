@@ -12,7 +12,7 @@ option that decides is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 import re
@@ -116,42 +116,15 @@ def choose(
     for role in given:
         if role not in ('t', 'v', 'y', 'segment') and not channel_of_column(role):
             raise DataError(f'{path}: --columns {role}: {role[2:]} is a unit; name it otherwise')
-    places = dict(given)
     rate, origin = options.rate, '--rate'
-    if rate is not None:
-        if 't' in given:
-            raise DataError(f'{path}: --rate and a column of time do not go together; drop one')
-    barred = {*given.values(), *empty}
-    for role in ('t', 'v', 'y', 'segment'):
-        if role not in places and (rate is None or role != 't'):
-            here = [i for i, name in enumerate(names) if name == role and i not in barred]
-            if len(here) > 1:
-                way = f'--columns {role}={here[0] + 1}'
-                raise DataError(
-                    f'{path}: column {role} stands there twice; keep one of them, or say which by '
-                    f'its number: {way}',
-                    options=way,
-                )
-            places |= dict.fromkeys([role][: len(here)], *here)
+    if rate is not None and 't' in given:
+        raise DataError(f'{path}: --rate and a column of time do not go together; drop one')
+    wanted = [role for role in 'tvy' if role != 't' or rate is None]
+    exact = [role for role in (*wanted, 'segment') if role not in given]
+    places = given | _exact(exact, names, {*given.values(), *empty}, path)
     free = [i for i in range(len(names)) if i not in {*places.values(), *empty}]
-    guessed: dict[str, int] = {}
-    for role in 'tvy':
-        if role in places or (role == 't' and rate is not None):
-            continue
-        fitting = _fitting(role, [(i, names[i]) for i in free])
-        if len(fitting) > 1:
-            # of several runs in groups, the one whose columns are named already
-            groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
-            fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
-        if len(fitting) > 1:
-            # v [V] beside v_b [V]
-            bare = [i for i in fitting if name_and_unit(names[i])[0] == role]
-            fitting = bare if len(bare) == 1 else fitting
-        if len(fitting) > 1:
-            raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
-        if fitting:
-            guessed[role] = fitting[0]
-            free.remove(fitting[0])
+    guessed = _guessed([role for role in wanted if role not in places], names, free, places, path)
+    free = [i for i in free if i not in guessed.values()]
     if rate is None and 't' not in {*places, *guessed}:
         rate, origin = _rate_of(scalars or {})
     known = {*places, *guessed, *('t' if rate is not None else '')}
@@ -178,6 +151,49 @@ def choose(
         faults=tuple(faults),
     )
     return places, table
+
+
+def _exact(
+    roles: Iterable[str], names: Sequence[str], barred: Collection[int], path: Path
+) -> dict[str, int]:
+    """Return the places of columns that are called as their quantities."""
+    places: dict[str, int] = {}
+    for role in roles:
+        here = [i for i, name in enumerate(names) if name == role and i not in barred]
+        if len(here) > 1:
+            way = f'--columns {role}={here[0] + 1}'
+            raise DataError(
+                f'{path}: column {role} stands there twice; keep one of them, or say which by its '
+                f'number: {way}',
+                options=way,
+            )
+        places |= dict.fromkeys([role][: len(here)], *here)
+    return places
+
+
+def _guessed(
+    roles: Iterable[str],
+    names: Sequence[str],
+    free: Sequence[int],
+    places: Mapping[str, int],
+    path: Path,
+) -> dict[str, int]:
+    """Return the places of quantities that one free column alone fits by its words and units."""
+    guessed: dict[str, int] = {}
+    for role in roles:
+        fitting = _fitting(role, [(i, names[i]) for i in free if i not in guessed.values()])
+        if len(fitting) > 1:
+            # of several runs in groups, the one whose columns are named already
+            groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
+            fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
+        if len(fitting) > 1:
+            # v [V] beside v_b [V]
+            bare = [i for i in fitting if name_and_unit(names[i])[0] == role]
+            fitting = bare if len(bare) == 1 else fitting
+        if len(fitting) > 1:
+            raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
+        guessed |= dict.fromkeys([role][: len(fitting)], *fitting)
+    return guessed
 
 
 def _add_channels(

@@ -42,9 +42,9 @@ def draw_diagnosis(
         (
             'errors',
             'Error before and after',
-            'Free run. Of the model as it was given; where an effect was added, of the same with '
-            'H refitted to other blocks of these data and nothing added; of the refined model, '
-            'fitted to other kinds of motion.',
+            'Free run of the model as it was given, and of the refined model, fitted to other '
+            'kinds of motion. Where an effect was added, also of the given model with H refitted '
+            'to other blocks of these data.',
             lambda: errors_figure(diagnosis),
         ),
     ]

@@ -5,11 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
-from piezo_ident.identification.results import DelayResult, Identification, rms_percent
+from piezo_ident.identification.results import (
+    DelayResult,
+    DynamicsResult,
+    Identification,
+    rms_percent,
+)
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.figures.delay_and_dynamics import (
@@ -41,23 +46,6 @@ def draw_identification(
         text = f'{row.data} {row.percent:.2g} %'
         texts.setdefault((row.record, row.segment), []).append(text)
     errors = {key: ', '.join(parts) for key, parts in texts.items()}
-    dynamics = identification.dynamics
-    if dynamics.response is None:
-        response = (
-            'G(z) z^-d of the model. Nothing that the voltage does has the breadth to measure it: '
-            'add steps, noise or a multisine.'
-        )
-    elif np.isfinite(dynamics.slope_measured):
-        response = (
-            'Measured on the noise segment, bars of one standard deviation, and the slope of H at '
-            'the bias times G(z) z^-d.'
-        )
-    else:
-        response = (
-            'Measured on all fast motion (Welch) from the voltage behind H to the displacement, '
-            'where it errs by less than 10 %, and G(z) z^-d of the model.'
-        )
-    response += ' Where the two part, G lacks something.'
     refitted = _refitted(identification)
     wanted: list[Wanted] = [
         (
@@ -86,6 +74,33 @@ def draw_identification(
             lambda: segments_figure(runs, errors),
         ),
     ]
+    wanted += _overviews(runs, refitted)
+    wanted += [
+        (
+            'delay',
+            'Delay',
+            _of_delay(identification.delay),
+            lambda: delay_figure(identification, runs),
+        ),
+        (
+            'response',
+            'Frequency response',
+            _of_response(identification.dynamics),
+            lambda: response_figure(identification),
+        ),
+        (
+            'orders',
+            'Orders of G',
+            'Free-run error on held-out noise of least squares at every order; grey: unstable.',
+            lambda: orders_figure(identification),
+        ),
+    ]
+    return draw_each(wanted, tick)
+
+
+def _overviews(runs: Sequence[PieceRun], refitted: Mapping[str, float]) -> list[Wanted]:
+    """Return the pictures of the widest records as a whole."""
+    wanted: list[Wanted] = []
     by_width = sorted(range(len(runs)), key=lambda i: -float(np.ptp(runs[i].piece.v)))
     for k, i in enumerate(sorted(by_width[:OVERVIEWS]), 1):
         caption = 'Each column of a long trace shows its smallest and largest sample.'
@@ -105,22 +120,27 @@ def draw_identification(
                 partial(overview_figure, runs[i], remark),
             )
         )
-    wanted += [
-        (
-            'delay',
-            'Delay',
-            _of_delay(identification.delay),
-            lambda: delay_figure(identification, runs),
-        ),
-        ('response', 'Frequency response', response, lambda: response_figure(identification)),
-        (
-            'orders',
-            'Orders of G',
-            'Free-run error on held-out noise of least squares at every order; grey: unstable.',
-            lambda: orders_figure(identification),
-        ),
-    ]
-    return draw_each(wanted, tick)
+    return wanted
+
+
+def _of_response(dynamics: DynamicsResult) -> str:
+    """Return how the frequency response was measured, if it was."""
+    if dynamics.response is None:
+        response = (
+            'G(z) z^-d of the model. Nothing that the voltage does has the breadth to measure it: '
+            'add steps, noise or a multisine.'
+        )
+    elif np.isfinite(dynamics.slope_measured):
+        response = (
+            'Measured on the noise segment, bars of one standard deviation, and the slope of H at '
+            'the bias times G(z) z^-d.'
+        )
+    else:
+        response = (
+            'Measured on all fast motion (Welch) from the voltage behind H to the displacement, '
+            'where it errs by less than 10 %, and G(z) z^-d of the model.'
+        )
+    return f'{response} Where the two part, G lacks something.'
 
 
 def _refitted(identification: Identification) -> dict[str, float]:

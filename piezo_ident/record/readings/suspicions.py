@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a record makes one suspect, though nothing of it is left out.
+Doubts about a record whose readings are all used.
 
-A stage that was never driven, or came up from a voltage below, rises for the first time along
-another curve, and does not come back to where it was.
+A stage that was never driven, or that comes from a lower voltage, rises along a curve of its own,
+and does not come back to its first position.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import difflib
 
 import numpy as np
 from piezo_ident.common.arrays import true_runs
-from piezo_ident.record.faults import constant, end_of_rest, MOVED, period_of
+from piezo_ident.record.readings.faults import constant, end_of_rest, MOVED, period_of
 from piezo_ident.record.record import KINDS, Piece, Record
 
 #: share of the voltage's range within which it rests where it began

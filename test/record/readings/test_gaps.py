@@ -11,8 +11,8 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.assemble import assemble, label_runs
-from piezo_ident.record.gaps import bridged, follows
 from piezo_ident.record.io import read, write
+from piezo_ident.record.readings.gaps import bridged, follows
 from piezo_ident.record.record import Piece, Record, Segment
 import pytest
 

@@ -19,8 +19,17 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
 from piezo_ident.record.channels import role_of
-from piezo_ident.record.jumps import AROUND, CODES, FAR, JUMP, Jumps, LEAST, least_jump, RINGS
 from piezo_ident.record.ordering import at_times
+from piezo_ident.record.readings.jumps import (
+    AROUND,
+    CODES,
+    FAR,
+    JUMP,
+    Jumps,
+    LEAST,
+    least_jump,
+    RINGS,
+)
 from piezo_ident.record.record import Fault, Piece, Record
 
 Runs = list[tuple[int, int]]
@@ -63,9 +72,8 @@ def without_faults(record: Record) -> Record:
     Return a record whose masks leave out the readings that cannot be the stage's.
 
     A straight line stands in for them, and for the voltage of a row that was lost as a whole.
-    Of the displacement of another axis, a channel, they become NaN.  What is found is counted in
-    the faults of the record.  Where nothing is, or where the masks were decided before, the same
-    record is returned.
+    In a channel with the displacement of another axis they become NaN.  The faults of the record
+    count them.  The same record comes back without any, or when its masks were decided before.
     """
     if any(piece.sound is not None for piece in record):
         return record

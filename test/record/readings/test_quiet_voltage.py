@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.record.quiet_voltage import with_quiet_voltage
+from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
 import pytest
 
 FS = 10_000.0

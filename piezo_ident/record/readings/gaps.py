@@ -4,11 +4,10 @@
 """
 Short gaps in a record, bridged for fitting.
 
-Reading splits a record wherever samples are missing.  A stage does not forget there: over a short
-gap its voltage moved on from where it was to where it is next, and its plays with it.  So pieces
-of one clock are joined by straight lines, or by the voltage that was played where the displacement
-alone is missing, however long.  What was not measured, with the moment after it, is kept from
-every fit and every error.
+Reading splits a record wherever samples are missing, but the stage keeps its memory: in a short
+gap the voltage moves on to its next value, and the plays with it.  Pieces of one clock are joined
+by straight lines.  Where the displacement alone is missing, however long, the voltage joins them.
+Every fit and every error leaves out a gap, and the moment after it.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.model.free_run import free_run
+from piezo_ident.record.readings.suspicions import rises_first, suspicions
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.suspicions import rises_first, suspicions
 from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
 

@@ -12,9 +12,9 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.operators.play import play_columns
-from piezo_ident.record.faults import without_faults
+from piezo_ident.record.readings.faults import without_faults
+from piezo_ident.record.readings.suspicions import line_error, misspelt, suspicions
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.record.suspicions import line_error, misspelt, suspicions
 from programs import SLOW, slow_model, SLOW_PROGRAM
 import pytest
 from scipy.signal import lfilter
