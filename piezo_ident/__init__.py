@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from piezo_ident.record.record import Record
     from piezo_ident.report.folder import write_report
     from piezo_ident.verbs.export import export_c
+    from piezo_ident.verbs.invert import invert, MultiAxisInverse
     from piezo_ident.verbs.learn import diagnose, identify
-    from piezo_ident.verbs.use import free_run, invert, MultiAxisInverse
+    from piezo_ident.verbs.predict import free_run
 
 __version__ = '0.1.0'
 
@@ -73,7 +74,7 @@ _HOMES = {
     'Learning': 'control.learning',
     'LiveInverse': 'control.live_inverse',
     'ModelError': 'common.errors',
-    'MultiAxisInverse': 'verbs.use',
+    'MultiAxisInverse': 'verbs.invert',
     'MultiAxisModel': 'model.multi_axis',
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
@@ -86,10 +87,10 @@ _HOMES = {
     'effects': 'effects',
     'export_c': 'verbs.export',
     'export_fmu': 'export.fmu',
-    'free_run': 'verbs.use',
+    'free_run': 'verbs.predict',
     'identify': 'verbs.learn',
     'identify_axes': 'axes.from_records',
-    'invert': 'verbs.use',
+    'invert': 'verbs.invert',
     'load': 'model.multi_axis',
     'read': 'record.io',
     'report': 'report',

@@ -34,7 +34,7 @@ from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sine_errors, SineError
 from piezo_ident.record.record import Record
 from piezo_ident.verbs.learn import identify
-from piezo_ident.verbs.use import free_run
+from piezo_ident.verbs.predict import free_run
 
 if TYPE_CHECKING:
     from piezo_ident.report import Prompt

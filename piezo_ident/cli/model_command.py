@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 import re
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from piezo_ident.cli.console import Console, deferred_interrupts
@@ -27,7 +27,6 @@ from piezo_ident.cli.files import (
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
-from piezo_ident.control.inverse import Inverse
 from piezo_ident.model.free_run import FreeRun, FreeRunErrors
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel, voltage_of
@@ -36,8 +35,11 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.tables.write import blocks_of
-from piezo_ident.verbs.export import export_c
-from piezo_ident.verbs.use import free_run, invert, MultiAxisInverse, predict, prediction_doubts
+from piezo_ident.verbs.predict import free_run, predict, prediction_doubts
+
+if TYPE_CHECKING:
+    from piezo_ident.control.inverse import Inverse
+    from piezo_ident.verbs.invert import MultiAxisInverse
 
 SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
@@ -184,6 +186,8 @@ def error_data(run: FreeRun) -> dict[str, Any]:
 
 def invert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident invert``."""
+    from piezo_ident.verbs.invert import invert
+
     model = _checked(args, 'a voltage')
     (reference,) = read_all([args.record], args, console, displacement_alone=True)
     piece = _whole(reference, model)
@@ -261,6 +265,7 @@ def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:
 def export_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident export``."""
     from piezo_ident.export.fmu import export_fmu
+    from piezo_ident.verbs.export import export_c
 
     if args.out is None:
         raise ConfigError('export: no file is named', options='--out stage.h')

@@ -1,0 +1,95 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Predict a record with a model of one axis or of several."""
+
+from __future__ import annotations
+
+from typing import overload
+
+from piezo_ident.common.arrays import Array
+from piezo_ident.model.free_run import free_run as run_axis
+from piezo_ident.model.free_run import FreeRun
+from piezo_ident.model.free_run import predict as predict_axis
+from piezo_ident.model.initial_memory import unknown_starts
+from piezo_ident.model.multi_axis import (
+    axis_record,
+    EachAxis,
+    MultiAxisModel,
+)
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+
+
+@overload
+def free_run(model: StageModel, record: Record) -> FreeRun: ...
+
+
+@overload
+def free_run(
+    model: StageModel | MultiAxisModel, record: Record
+) -> FreeRun | EachAxis[FreeRun]: ...
+
+
+def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | EachAxis[FreeRun]:
+    """
+    Predict a record in free run, and compare it with what was measured.
+
+    A record that does not start at the lowest voltage starts from an unknown memory, which is
+    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
+    shows.  Nothing is fitted to the samples after that part.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    record : Record
+        Its displacement serves only the estimate and the errors.
+
+    Returns
+    -------
+    FreeRun, or EachAxis of FreeRun
+
+    Raises
+    ------
+    ModelError
+        When a piece has another sampling rate than the model, or the prediction overflows.
+    DataError
+        When the record holds no displacement, which `simulate` of the model does not need; or
+        lacks an axis.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> stage = pi.SimulatedStage.load('paper')
+    >>> record = stage.play(pi.Program.load('minor_loops'))
+    >>> run = pi.free_run(stage.model, record)
+    >>> run.predicted.shape == run.measured.shape
+    True
+    >>> run.errors.percent < 0.01
+    True
+    """
+    if not isinstance(model, MultiAxisModel):
+        return run_axis(model, record)
+    seen = model.seen(record)
+    return EachAxis({axis: run_axis(x, seen[axis]) for axis, x in model.axes.items()})
+
+
+def predict(
+    model: StageModel | MultiAxisModel, record: Record
+) -> tuple[Array, ...] | EachAxis[tuple[Array, ...]]:
+    """Return the displacement that voltages cause, whatever was measured, an array a piece [m]."""
+    if not isinstance(model, MultiAxisModel):
+        return predict_axis(model, record)
+    seen = model.seen(record)
+    return EachAxis({axis: predict_axis(x, seen[axis]) for axis, x in model.axes.items()})
+
+
+def prediction_doubts(model: StageModel | MultiAxisModel, record: Record) -> tuple[str, ...]:
+    """Return what limits the trust in a prediction from voltages alone."""
+    if not isinstance(model, MultiAxisModel):
+        return (*unknown_starts(model, record), *model.extrapolation(record))
+    return tuple(
+        f'axis {axis}: {text}'
+        for axis, x in model.axes.items()
+        for text in prediction_doubts(x, axis_record(record, axis))
+    )
