@@ -58,7 +58,7 @@ class CandidateSearch:
     ) -> None:
         self._simulator, self._given, self._rng, self._tick = simulator, given, rng, tick
         self._noise, self._missed = noise, missed
-        self._columns = TrialColumns(simulator, given, lines)
+        self._lines = lines
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
         # a known effect of the path that has changed since would look like another one
@@ -202,7 +202,7 @@ class CandidateSearch:
             self._simulator,
             fitted,
             effects,
-            self._columns,
+            TrialColumns(self._simulator, fitted.state, self._lines),
             self._noise,
             self._rng,
             tick,

@@ -78,8 +78,8 @@ class TrialColumns:
     """
     What trials add to the rows of one state, computed once.
 
-    An effect that is only slightly on adds the same beside another H or another effect, but for
-    their small differences.  So every search of some data scores the same columns.
+    Beside a sum of plays an effect that is only slightly on adds the same as beside a wide H, but
+    not beside the H as given: there what a backlash adds differs enough to hide it.
     """
 
     def __init__(self, simulator: Simulator, state: State, lines: Sequence[float]) -> None:

@@ -95,22 +95,10 @@ def choose(
     """
     Return the place of each quantity among the columns, and a table that lacks the columns.
 
-    Parameters
-    ----------
-    names : sequence of str
-        As they stand in the file, some of them perhaps empty or twice.
-    options : ReadOptions
-    path : path
-        For messages.
-    scalars : mapping of str to float, optional
-        Numbers beside the columns, among which a sampling rate may be.
-    empty : iterable of int
-        Places of columns that hold nothing.
-
-    Raises
-    ------
-    DataError
-        When a quantity is missing or ambiguous; the message shows the option to give.
+    The names stand as in the file, some of them perhaps empty or twice.  A sampling rate may be
+    among the `scalars`, numbers beside the columns; `empty` are places of columns that hold
+    nothing.  DataError when a quantity is missing or ambiguous; the message names the option, and
+    the `path` of the file.
     """
     given = {role: _place(role, name, names, path) for role, name in options.named.items()}
     for role in given:
