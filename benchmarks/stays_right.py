@@ -31,8 +31,8 @@ from truths import make_stage
 from truths.linear import Cascade, RATE
 from truths.stage import SPAN, Stage
 
-#: stages of `truths` with creep, by seed, each with a mode that a load can move; the adaptation was
-#: built beside the stages 2 and 7, and these were not looked at
+#: seeds of stages of `truths` with creep and a mode that a load can move; the adaptation was built
+#: beside the seeds 2 and 7, and nobody had looked at these
 SEEDS = (4, 6, 8, 9)
 #: when a stage changes, how long it is judged then, and when its sensor is cut off [s]
 AT, JUDGED, CUT = 5.0, 5.0, 15.0

@@ -22,7 +22,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 SLOWEST = (
     'diagnosis/test_diagnose.py',
     'identification/test_identify.py',
-    'diagnosis/test_conclusion.py',
+    'verbs/test_several_axes.py',
     'diagnosis/test_two_effects.py',
     'examples/test_tutorial.py',
     'identification/test_free_run_fit.py',

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Check the inputs of an inverse: motion, limits and further channels."""
+"""Check the inputs of an inverse: motion, its reach and unit, limits and further channels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
+from piezo_ident.control.expectation import known_rms
 from piezo_ident.model.stage_model import StageModel
+from scipy.optimize import brentq
+
+#: error at rest, normalised, above which a position is out of reach
+SHORT = 1e-4
+#: largest excess over the limits that is accepted from a less accurate model [of the span]
+SLIGHT = 1e-2
+#: motions larger or smaller than these spans of the model probably have a wrong unit
+FAR, FAINT = 30.0, 2e-3
 
 
 def checked_motion(wanted: ArrayLike) -> Array:
@@ -64,3 +73,61 @@ def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -
                 'each of the wanted motion'
             )
     return {name: np.pad(z, around, mode='edge') for name, z in found.items()}
+
+
+def rest_at(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
+    """Find the normalised voltage at which the model rests at the first position."""
+    s = model.scaling
+    x0 = float(s.x(y[0]))
+
+    def miss(u: float) -> float:
+        return float(model.chain().reset(u, u)) - x0
+
+    below, above = miss(bounds[0]), miss(bounds[1])
+    near = max(SHORT, tolerance(model, y) / abs(s.Y))
+    if (below > near or above < -near) and not (clip and max(below, -above) < FAR):
+        ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
+        is_far, missed = max(below, -above) > FAR, s.Y * (below if below > 0.0 else above)
+        raise DataError(
+            f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
+            f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'
+            + ('; is the motion in metres?' if is_far else f'; {shifted(missed)}'),
+            options='' if is_far else '--clip',
+        )
+    if below >= 0.0 or above <= 0.0:
+        return bounds[0] if below >= 0.0 else bounds[1]
+    return float(brentq(miss, *bounds, xtol=1e-14))
+
+
+def tolerance(model: StageModel, y: Array) -> float:
+    """Excess over the limits that is accepted: below the error of the model [m]."""
+    return min(known_rms(model) or 0.0, SLIGHT * float(np.ptp(y)))
+
+
+def extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
+    """Warn of voltages outside the identified range, and of a motion that is very small."""
+    s = model.scaling
+    (low, high), warnings = s.range, []
+    outside = np.mean((v < low - SHORT * s.V) | (v > high + SHORT * s.V))
+    if outside:
+        warnings.append(
+            f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '
+            f'identified range {low:g} .. {high:g} V, where the model is an extrapolation'
+        )
+    return [*warnings, *faint(model, y)]
+
+
+def faint(model: StageModel, y: Array) -> list[str]:
+    """Warn of a motion so small that its unit is doubtful."""
+    s = model.scaling
+    if not 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
+        return []
+    return [
+        f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
+        f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
+    ]
+
+
+def shifted(by: float) -> str:
+    """Say by how much a motion must be raised or lowered [m]."""
+    return f'{"raise" if by > 0.0 else "lower"} the motion by {1e6 * abs(by):.3g} um'

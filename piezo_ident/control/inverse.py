@@ -26,9 +26,18 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.common.showable import Showable
-from piezo_ident.control.expectation import expect, known_rms
+from piezo_ident.control.expectation import expect
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
-from piezo_ident.control.inputs import checked_limits, checked_motion, padded
+from piezo_ident.control.inputs import (
+    checked_limits,
+    checked_motion,
+    extrapolated,
+    faint,
+    padded,
+    rest_at,
+    shifted,
+    tolerance,
+)
 from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
@@ -36,7 +45,6 @@ from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresi
 from piezo_ident.model.metrics import percent, percent_of_stroke
 from piezo_ident.model.stage_model import StageModel
 from scipy.ndimage import maximum_filter1d
-from scipy.optimize import brentq
 
 #: most passes of the iteration
 PASSES = 30
@@ -51,17 +59,11 @@ SHORTEST = 0.2
 MATTERS, LARGE = 1e-3, 0.1
 #: span of a constant motion, normalised
 STANDS = 1e-9
-#: error at rest, normalised, above which a position is out of reach
-SHORT = 1e-4
-#: largest excess over the limits that is accepted from a less accurate model [of the span]
-SLIGHT = 1e-2
 #: difference of two neighbouring samples that is a jump [of the span of the motion]
 JUMPS = 0.05
 #: changes of the voltage [of the span of the model] below which the lead is cut off, largest
 #: first; the cut may move the motion by at most the last number [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
-#: motions larger or smaller than these spans of the model probably have a wrong unit
-FAR, FAINT = 30.0, 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,8 +193,8 @@ def invert(
     if missed.any():
         most = abs(s.Y) * float(largest[missed].max())
         warnings.append(_out_of_reach(task, best, used, missed, most, slew))
-        if not clip and most > _tolerance(model, y):
-            raise DataError('; '.join([*warnings, *_faint(model, y)]), options='--clip')
+        if not clip and most > tolerance(model, y):
+            raise DataError('; '.join([*warnings, *faint(model, y)]), options='--clip')
     error = best.error[used][~maximum_filter1d(missed, task.near)]
     left = float(np.sqrt(np.mean(error**2))) / task.span if error.size else 0.0
     expected = expect(model, v, y)
@@ -216,7 +218,7 @@ def invert(
         expected=None if expected.rms is None else percent(expected.rms, span),
         expected_rms=expected.rms,
         expected_offset=expected.offset,
-        warnings=(*warnings, *_extrapolated(model, v, y), *expected.warnings),
+        warnings=(*warnings, *extrapolated(model, v, y), *expected.warnings),
     )
 
 
@@ -285,7 +287,7 @@ def _task(
             f'invert: the limits lie beyond what the model holds for, {s.range[0]:g} .. '
             f'{s.range[1]:g} V; give others'
         )
-    rest, around = _rest(model, y, H.limits, clip), (Q.ahead, Q.behind)
+    rest, around = rest_at(model, y, H.limits, clip), (Q.ahead, Q.behind)
     x = np.pad(s.x(y), around, mode='edge')
     span = float(np.ptp(x)) if np.ptp(x) > STANDS else 1.0
     task = _Task(
@@ -364,7 +366,7 @@ def _out_of_reach(
     if jumps.max() > JUMPS * task.span:
         remedy = '; the motion jumps there: round it over two periods of the lowest mode'
     elif np.isinf(slew) and (at_top.all() or not at_top.any()):
-        remedy = f'; {_shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
+        remedy = f'; {shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
     speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'
     return (
         f'{t.size} samples of the wanted motion, between {t[0]:.4g} and {t[-1]:.4g} s, are out of '
@@ -388,60 +390,3 @@ def _of_hysteresis(
     if wide:
         return RateInverse(h, wide[0].parameters, rate, ends, step), linear
     return HysteresisInverse(h, ends, step, pole), linear
-
-
-def _rest(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:
-    """Find the normalised voltage at which the model rests at the first position."""
-    s = model.scaling
-    x0 = float(s.x(y[0]))
-
-    def miss(u: float) -> float:
-        return float(model.chain().reset(u, u)) - x0
-
-    below, above = miss(bounds[0]), miss(bounds[1])
-    near = max(SHORT, _tolerance(model, y) / abs(s.Y))
-    if (below > near or above < -near) and not (clip and max(below, -above) < FAR):
-        ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
-        is_far, missed = max(below, -above) > FAR, s.Y * (below if below > 0.0 else above)
-        raise DataError(
-            f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
-            f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'
-            + ('; is the motion in metres?' if is_far else f'; {_shifted(missed)}'),
-            options='' if is_far else '--clip',
-        )
-    if below >= 0.0 or above <= 0.0:
-        return bounds[0] if below >= 0.0 else bounds[1]
-    return float(brentq(miss, *bounds, xtol=1e-14))
-
-
-def _tolerance(model: StageModel, y: Array) -> float:
-    """Excess over the limits that is accepted: below the error of the model [m]."""
-    return min(known_rms(model) or 0.0, SLIGHT * float(np.ptp(y)))
-
-
-def _extrapolated(model: StageModel, v: Array, y: Array) -> list[str]:
-    """Warn of voltages outside the identified range, and of a motion that is very small."""
-    s = model.scaling
-    (low, high), warnings = s.range, []
-    outside = np.mean((v < low - SHORT * s.V) | (v > high + SHORT * s.V))
-    if outside:
-        warnings.append(
-            f'{outside:.1%} of the voltage, {v.min():.4g} .. {v.max():.4g} V, lie outside the '
-            f'identified range {low:g} .. {high:g} V, where the model is an extrapolation'
-        )
-    return [*warnings, *_faint(model, y)]
-
-
-def _faint(model: StageModel, y: Array) -> list[str]:
-    """Warn of a motion so small that its unit is doubtful."""
-    s = model.scaling
-    if not 0.0 < np.abs(y - s.y0).max() < FAINT * abs(s.Y):
-        return []
-    return [
-        f'the wanted motion stays within {1e6 * np.abs(y - s.y0).max():.2g} um of zero, of '
-        f'{1e6 * abs(s.Y):.3g} um; is it in metres?'
-    ]
-
-
-def _shifted(by: float) -> str:
-    return f'{"raise" if by > 0.0 else "lower"} the motion by {1e6 * abs(by):.3g} um'

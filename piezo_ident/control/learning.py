@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, interpolated
 from piezo_ident.common.errors import DataError
-from piezo_ident.control.inverse import FAR, Inverse, invert
+from piezo_ident.control.inputs import FAR
+from piezo_ident.control.inverse import Inverse, invert
 from piezo_ident.control.linear_inverse import lowest_mode, smoothed
 from piezo_ident.model.metrics import doubts, percent, REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel

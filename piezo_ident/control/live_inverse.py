@@ -24,8 +24,7 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
-from piezo_ident.control.inputs import checked_limits
-from piezo_ident.control.inverse import SHORT
+from piezo_ident.control.inputs import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
     least_preview,

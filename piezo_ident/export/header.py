@@ -30,8 +30,7 @@ from piezo_ident.control.hysteresis_inverse import (
     TRIALS,
     with_rising_hysteresis,
 )
-from piezo_ident.control.inputs import checked_limits
-from piezo_ident.control.inverse import SHORT
+from piezo_ident.control.inputs import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import (
     check_preview,
     is_filter,

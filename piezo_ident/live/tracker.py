@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.control.inverse import FAR
+from piezo_ident.control.inputs import FAR
 from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
 from piezo_ident.live.corrector import Follower
 from piezo_ident.live.guard import Guard, GuardSettings
