@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sample clock of a stream by its time stamps alone, at any rate and from any publisher."""
+"""Follow the sample clock of a stream by its time stamps, at any rate and from any publisher."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.record.clock import has_restarted
 
-#: a clock that goes ahead by more than this is another one: a day, the longest capture [s]
+#: a clock that jumps ahead by more is another clock: a day, the longest capture [s]
 LONGEST_GAP = 86_400.0
 
 
 class BlockClock:
     """
-    Tells of each block whether it goes on, skips samples, came before, or starts over.
+    Clock of a stream; it says if a block goes on, skips samples, came before, or starts over.
 
     Attributes
     ----------
@@ -47,14 +47,15 @@ class BlockClock:
         Parameters
         ----------
         t : ndarray, shape (n,)
-            Its time stamps [s], those of samples in a row.
+            Time stamps [s] of consecutive samples.
 
         Returns
         -------
         Kind
             `Kind.START`, `Kind.NEXT`, `Kind.GAP` or `Kind.LATE`.
         int
-            Samples that are missing before the block, or the first ones of it that came before.
+            Samples missing before the block (`Kind.GAP`), or samples at its beginning that came
+            before (`Kind.LATE`).
         """
         first, last, before = float(t[0]), float(t[-1]), self.last
         if last > first:
@@ -62,7 +63,7 @@ class BlockClock:
         if np.isnan(before):
             self.begin, self.last = first, last
             return Kind.START, 0
-        # a first block that comes twice ends where the stream ends: that is no restart
+        # a repeated first block ends at the end of the stream; the clock did not restart
         is_back = last < before and has_restarted(first, before, self.begin, self.period)
         if is_back or first - before > LONGEST_GAP:
             self.restarts += 1

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Blocks as they come, kept for a record: bounded, checked, and by the same path as a bag of them.
+Keep incoming blocks for a record, within bounds of time and memory.
 
-What is wrong with the samples is met as for a bag, in `piezo_ident.record.join` and
-`piezo_ident.record.assemble`.  Beside them a capture knows which blocks could not be read, and
-what was forgotten to make room.
+The record is made by the same functions as the record of a bag: `piezo_ident.record.join` and
+`piezo_ident.record.assemble` deal with faulty samples.  A capture also reports messages that could
+not be read, and the time that was dropped to stay within the bounds.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
 
-#: segments that the three steps stand on
+#: kinds of segments that the three steps of the identification need
 NEEDED = ('step', 'noise', 'triangle')
-#: samples and blocks of a topic that are kept, and labels that are counted, whatever the times are
+#: most samples and blocks that are kept of a topic, and most labels that are counted
 MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
 
 
 def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -> None:
     """
-    Refuse a record that lost too much of what the three steps stand on.
+    Refuse a record that lost too much of a segment that the three steps need.
 
-    Time that is missing between two pieces is charged to the segments on both of its sides.
+    Time missing between two pieces counts for the segments on both sides.
 
     Parameters
     ----------
     record : Record
     sent : mapping of str to float, optional
-        Time [s] of each kind of segment in the voltage: also what is missing at either end of
-        the record is then seen.
+        Time [s] of each kind of segment in the voltage.  It reveals samples that are missing at
+        either end of the record.
 
     Raises
     ------
@@ -77,18 +77,18 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
 
 
 class _Topic:
-    """The blocks of one topic that are kept, its clock, and what could not be kept."""
+    """Kept blocks of one topic, its clock, and counts of samples that were dropped."""
 
     def __init__(self) -> None:
         self.stream, self.clock = BlockStream(), BlockClock()
-        # counts of samples at which the clock restarted, and samples that are no longer kept
+        # the number of samples at each restart of the clock, and the number of dropped samples
         self._runs: list[int] = []
         self.dropped = self._newest = self.not_finite = 0
-        # samples of ramps of the driver whose t came again, in a command that went on, and since
+        # samples of ramps of the driver within a command that went on, and since the last block
         self.ramped = self._ramp = 0
 
     def add(self, samples: Samples, arrival: int) -> None:
-        """Take a block; where one with impossible times lies, the record will say."""
+        """Take a block; the record reports blocks with impossible times."""
         t, restarts = samples.t, self.clock.restarts
         if samples.segment == RAMPED:
             self._ramp += t.size
@@ -105,15 +105,15 @@ class _Topic:
 
     @property
     def total(self) -> int:
-        """Samples so far."""
+        """Samples so far, with the dropped ones."""
         return self.dropped + self.stream.n
 
     def seconds(self, n: int) -> float:
-        """Return how long so many samples are [s]; zero before the period is known."""
+        """Convert a number of samples to a time [s]; zero before the period is known."""
         return n * self.clock.period if np.isfinite(self.clock.period) else 0.0
 
     def make_room(self, limit: float) -> float:
-        """Forget the oldest run, or a tenth of the only one; return how long it was [s]."""
+        """Drop the oldest run, or a tenth of a single run; return the dropped time [s]."""
         n = next((run - self.dropped for run in self._runs if run > self.dropped), 0)
         if not n:
             share = 0.1 * limit / self.clock.period if self.seconds(self.stream.n) > limit else 0
@@ -126,19 +126,19 @@ class _Topic:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A capture as it was at one moment; making a record of it can wait for a quiet hour."""
+    """A copy of a capture at one moment; its record can be made later, in another thread."""
 
     streams: Mapping[str, BlockStream]
     faults: tuple[Fault, ...] = ()
 
     def record(self, name: str = 'capture') -> Record:
         """
-        Return the record.
+        Make the record.
 
         Raises
         ------
         DataError
-            For data that cannot be used without a guess; also when there are none.
+            If voltage or displacement are missing, or could only be used by guessing.
         """
         for key, cure in (
             ('voltage', 'start the excitation, or replay a bag'),
@@ -171,8 +171,8 @@ class Capture:
     Parameters
     ----------
     limit : float, optional
-        Longest measured time that is kept [s].  Beyond it the oldest whole run of the sample
-        clock is forgotten, or the oldest tenth where there is only one.
+        Longest measured time that is kept [s].  A longer capture drops the oldest run of the
+        sample clock, or the oldest tenth of a single run.
     """
 
     def __init__(self, limit: float = 600.0) -> None:
@@ -214,26 +214,26 @@ class Capture:
             self._forgotten += forgotten if key == 'voltage' else 0.0
 
     def unreadable(self, key: str, reason: str) -> None:
-        """Take note of a message that is no block."""
+        """Count a message that does not hold a block."""
         self._unreadable[key] = (self._unreadable.get(key, (0, ''))[0] + 1, reason)
 
     def mark(self) -> dict[str, int]:
-        """Return what tells later what was captured after now; not across `clear`."""
+        """Mark this moment for `seconds_since` and `snapshot`; `clear` makes marks invalid."""
         return {key: topic.total for key, topic in self._topics.items()}
 
     def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
-        """Return the measured time of a topic after a mark that is kept [s]."""
+        """Measured time of a topic after a mark, as far as it is kept [s]."""
         topic = self._topics.get(key, _Topic())
         return topic.seconds(min(topic.stream.n, topic.total - mark.get(key, 0)))
 
     def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
         """
-        Return all that was captured up to now, at little cost.
+        Copy the capture up to now, at little cost.
 
         Parameters
         ----------
         since : mapping of str to int, optional
-            Only what came after this mark; see `mark`.
+            A mark; the copy begins there.  See `mark`.
         """
         faults = [
             Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
@@ -249,12 +249,12 @@ class Capture:
         return Snapshot(streams, tuple(faults))
 
     def record(self, name: str = 'capture') -> Record:
-        """Return what was captured as a record; see `Snapshot.record`."""
+        """Make a record of the capture; see `Snapshot.record`."""
         return self.snapshot().record(name)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """What was captured, in order of appearance."""
+        """Topics of the capture, in order of appearance."""
         return tuple(self._topics)
 
     @property
@@ -287,7 +287,7 @@ class Capture:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What is wrong with the capture so far, one sentence a topic."""
+        """Faults of the capture so far, a sentence for each kind and topic."""
         problems = []
         for key, topic in self._topics.items():
             if topic.clock.lost:

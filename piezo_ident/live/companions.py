@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The voltage of a further axis, kept until the block of the first axis of the same time comes."""
+"""Keep the voltage of a further axis until the block of the first axis at the same time comes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.record.blocks import Samples
 
-#: samples that are kept at most
+#: most samples that are kept
 MOST = 1_000_000
 
 
@@ -36,7 +36,7 @@ class Companion:
         self._newest = -1
 
     def add(self, samples: Samples) -> None:
-        """Keep a block; one whose time jumps back begins a new stream."""
+        """Keep a block; a block whose time jumps back begins a new stream."""
         ticks = self._ticks(samples.t)
         if ticks[0] <= self._newest or len(self._kept) > MOST:
             self._kept.clear()
@@ -44,16 +44,16 @@ class Companion:
         self._newest = ticks[-1]
 
     def clear(self) -> None:
-        """Forget all: the stream has ended."""
+        """Forget all samples: the stream has ended."""
         self._kept.clear()
         self._newest = -1
 
     def has(self, t: NDArray[np.float64]) -> bool:
-        """Return whether there is a sample at each of some times."""
+        """Return whether a sample is kept for each time, shape (n,) [s]."""
         return all(tick in self._kept for tick in self._ticks(t))
 
     def take(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the samples at some times, NaN where there is none; they are not kept."""
+        """Remove and return the samples at the given times; NaN stands for a missing sample."""
         return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
 
     def _ticks(self, t: NDArray[np.float64]) -> list[int]:

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The estimate beside a running stage: prediction and displacement joined for an observer.
+Estimate the displacement of a running stage from its prediction and earlier displacement.
 
-An estimate waits until the displacement of a horizon before has come, or is known to be missing:
-later displacement has come, or for `PATIENCE` none did.  It therefore does not matter which of the
-two streams comes first.  What still waits when a stream starts over has no estimate.
+An observer corrects a sample of the prediction by displacement at least a horizon earlier.  The
+sample waits until this displacement has come or is known to be missing.  It is missing if later
+displacement has come, or if none came for `PATIENCE`.  The order in which prediction and
+displacement arrive therefore makes no difference.  Samples that still wait when the stream starts
+over are dropped.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.record.blocks import Samples
 
-#: what an observer tells of its corrections, and of which of its numbers
+#: names of the corrections, with the attribute of `Observed` that holds each
 CORRECTIONS = {
     'offset/value': 'offset',
     'offset/std': 'offset_std',
@@ -34,30 +36,30 @@ CORRECTIONS = {
     'memory/band': 'band',
     'estimate/std': 'std',
 }
-#: the same of a gain that is followed
+#: the same for the gain, if it is followed
 GAIN = {'gain/value': 'gain', 'gain/std': 'gain_std'}
-#: the names of what is learnt
+#: names of the learnt changes of the model
 LEARNT = ('learnt/gain', 'learnt/loop')
-#: corrections a second
+#: corrections published per second of the stream
 RATE = 50.0
-#: share of the span by which the band of unknown plays may shrink in a block that is judged: while
-#: plays become known what is left is a matter of them
+#: most change of the band of unknown plays within a block that the model learns from, as a share
+#: of the span: while plays become known, they explain the remaining error
 SETTLED = 1e-5
-#: share of the span from which creep of earlier motion is told
+#: smallest creep from earlier motion that is mentioned, as a share of the span
 FAINT = 1e-4
-#: standard deviations from which a change of the gain is told (taste)
+#: smallest change of the gain that is mentioned, in standard deviations (taste)
 SURE = 3.0
-#: time of the stream for which displacement is waited for [s]
+#: longest wait for displacement, in time of the stream [s]
 PATIENCE = 0.5
-#: time constant by which a wanted motion takes over what is found: a step would excite the modes
+#: time constant with which a wanted motion takes over a correction; a step would excite the modes
 #: of a stage [s] (taste)
 FADE = 0.01
-#: what it takes over at most, as a share of the span: a sensor may be at fault (taste)
+#: largest correction of a wanted motion, as a share of the span: a sensor may be at fault (taste)
 MOST = 0.1
 
 
 def gain_change(value: float, std: float) -> str:
-    """Return a change of the gain by size; empty where it is not sure."""
+    """Format a change of the gain; empty if it is within `SURE` standard deviations of zero."""
     if not abs(value) > SURE * std > 0.0:
         return ''
     return f'gain {100.0 * value:+.1f} +- {max(100.0 * std, 0.05):.1f} %'
@@ -66,16 +68,16 @@ def gain_change(value: float, std: float) -> str:
 @dataclass(frozen=True, eq=False)
 class Estimated:
     """
-    An estimate as a block, and what the observer says of its samples.
+    A block of the estimate, with the state of the observer at its samples.
 
     Attributes
     ----------
     samples : Samples
     seen : Observed
     corrections : list of dict
-        The numbers of `CORRECTIONS`, of the first sample of each stretch of a steady rate.
+        The numbers of `CORRECTIONS`, `rate` times a second of the stream.
     is_settled : bool
-        Whether what is left is no matter of plays that become known.
+        Whether the band of unknown plays stays the same over the block, see `SETTLED`.
     """
 
     samples: Samples
@@ -86,7 +88,7 @@ class Estimated:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """A block of prediction that waits: its first tick, and the voltage."""
+    """A waiting block of prediction, with its first tick and its voltage."""
 
     tick: int
     prediction: Samples
@@ -95,7 +97,7 @@ class _Block:
 
 class Corrector:
     """
-    Corrects predictions by displacement that comes at least a horizon before.
+    Corrects predictions by displacement of at least a horizon before.
 
     Parameters
     ----------
@@ -104,15 +106,15 @@ class Corrector:
     gain : bool, optional
         Whether the gain is followed, too.
     rate : float, optional
-        Corrections that are told a second of the stream.
+        Corrections published per second of the stream.
     adapt : {'off', 'gain', 'hysteresis'}, optional
-        What the estimate learns of the stage: what the observer corrects is then the free run of
-        the model that was learnt.
+        Part of the model that the corrector learns.  The observer then corrects the free run of
+        the learnt model.
 
     Attributes
     ----------
     told : dict
-        The corrections that were told last.
+        The corrections published last.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class Corrector:
 
     @property
     def knows_memory(self) -> bool:
-        """Whether the voltage of the run, with its gaps, tells the outputs of all plays."""
+        """Whether the voltage of the run, with its gaps, determines the outputs of all plays."""
         # the observer learns of a gap when the displacement of its time is decided
         gaps = any(np.isnan(block.prediction.t[0]) for block in self._waiting)
         return self._observer is not None and self._observer.known and not gaps
@@ -142,7 +144,7 @@ class Corrector:
         """
         Take the model that predicts from now on.
 
-        `recalled` makes of a model a run under the voltage so far; at rest when absent.
+        `recalled` turns a model into a run that has seen the voltage so far; at rest when absent.
         """
         self._model = model
         self._learn_anew(recalled)
@@ -150,7 +152,7 @@ class Corrector:
     def set_up(
         self, horizon: int, gain: bool, adapt: Learns, recalled: Recalled = StageModel.stream
     ) -> None:
-        """Take another horizon, or follow the gain or not, or learn, and begin anew."""
+        """Change the horizon, whether the gain is followed, and the learnt part; begin anew."""
         self._horizon, self._gain, self._adapt = horizon, gain, adapt
         self._learn_anew(recalled)
 
@@ -163,13 +165,13 @@ class Corrector:
 
     @property
     def learnt(self) -> StageModel:
-        """The model with what was learnt; DataError where nothing is."""
+        """The learnt model; DataError if the corrector does not learn."""
         if self._adaptation is None:
             raise DataError('nothing is learnt: there is no model, or the parameter adapt is off')
         return self._adaptation.learnt_model
 
     def restore(self) -> str:
-        """Forget what was learnt; return what that was."""
+        """Return to the given model; the message says how much motion is forgotten."""
         said = self.learnt.identification['adaptation'][-1]['seconds']
         if self._adaptation is not None:
             self._adaptation.restore()
@@ -177,9 +179,9 @@ class Corrector:
 
     def ahead(self, lead: int, n: int) -> tuple[Array, float]:
         """
-        Return what offset and creep [m] will be, shape (n,), and the relative change of the gain.
+        Extrapolate offset plus creep [m], shape (n,), and return the relative change of the gain.
 
-        The first of the samples comes `lead` samples behind the last voltage.
+        The first of the n samples comes `lead` samples after the last voltage.
         """
         if self._observer is None:
             return np.zeros(n), 0.0
@@ -187,14 +189,14 @@ class Corrector:
         return self._observer.ahead(lead + waiting, n)
 
     def accept(self) -> str:
-        """Take the present step of the sensor as its zero; return what was accepted."""
+        """Take the present step of the sensor as its zero; the message gives its size."""
         if self._observer is None:
             raise DataError('there is no estimate yet: no step to accept')
         return f'a step of {1e6 * self._observer.accept():+.3g} um is taken as the zero'
 
     @property
     def corrected(self) -> str:
-        """What is corrected, by size."""
+        """Sizes of the corrections, as text."""
         offset, creep, gain, std = (
             self.told.get(name, 0.0)
             for name in ('offset/value', 'creep/value', 'gain/value', 'gain/std')
@@ -213,18 +215,18 @@ class Corrector:
         self._observer: Observer | None = None
         self._waiting: list[_Block] = []
         self._measured: list[tuple[Integers, Array]] = []
-        # the tick that comes next, and the newest ones that displacement has told of and that are
-        # decided
+        # the next tick of the voltage, the newest tick with displacement, and the newest tick
+        # whose displacement has come or is given up
         self._next, self._told, self._decided = 0, -1, -1
         self._last: tuple[float, float] | None = None
-        # whether what is left is no matter of plays that become known
+        # see `Estimated.is_settled`
         self._is_settled = True
 
     def predicted(self, prediction: Samples, voltage: Samples, known: bool) -> list[Estimated]:
         """
-        Take a prediction, of the last samples of a block of voltage; return what can be estimated.
+        Take the prediction for the last samples of a block of voltage; return finished estimates.
 
-        `known` is whether a run that was under way before this model has the memory of the plays.
+        `known` says whether the run knew the outputs of the plays before the first block.
         """
         if self._model is None:
             return []
@@ -247,7 +249,7 @@ class Corrector:
             self._is_new = False
             self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
         elif kind is Kind.GAP and self._last is not None:
-            # as the prediction went on, over a straight line
+            # the predictor bridged this gap by a straight line, too
             share = np.arange(1, missing + 1) / (missing + 1)
             v0, y0 = self._last
             y = y0 + (float(prediction.values[0]) - y0) * share
@@ -261,7 +263,7 @@ class Corrector:
         self._next += v.size
 
     def measured(self, t: Array, y: Array) -> list[Estimated]:
-        """Take displacement [m] of times that were predicted; return what can be estimated."""
+        """Take displacement [m] at times t [s] with a prediction; return finished estimates."""
         if self._observer is None or np.isnan(self._clock.period):
             return []
         ticks = np.rint((t - self._clock.begin) / self._clock.period).astype(np.int64)
@@ -270,7 +272,7 @@ class Corrector:
         return self._estimates()
 
     def _estimates(self) -> list[Estimated]:
-        """Return the estimates of the blocks whose displacement is decided."""
+        """Estimate all blocks whose displacement has come or is given up."""
         newest, decided = self._next - 1, self._told
         if (newest - self._told) * self._clock.period >= PATIENCE:
             decided = max(decided, newest - self._horizon)
@@ -291,7 +293,7 @@ class Corrector:
             seen = self._observer.process(block.v, free, y)
             self._is_settled = bool(np.ptp(seen.band) <= SETTLED * self.span)
             if np.isnan(block.prediction.t[0]):
-                # nobody saw the voltage
+                # the voltage in a gap is unknown
                 self._observer.lose_memory()
                 continue
             samples = replace(block.prediction, values=seen.estimate)
@@ -299,7 +301,7 @@ class Corrector:
         return done
 
     def _learnt_run(self, block: _Block, y: Array) -> Array:
-        """Return the free run of the model that was learnt, from displacement a horizon before."""
+        """Run the learnt model freely; it learns from displacement y a horizon before."""
         free = block.prediction.values
         if self._adaptation is None:
             return free
@@ -308,7 +310,7 @@ class Corrector:
         return self._adaptation.process(block.v, t, free, y, self._is_settled)
 
     def _tell(self, t: Array, seen: Observed) -> list[dict[str, float]]:
-        """Return the corrections that begin a stretch."""
+        """Pick the corrections to publish, `rate` times a second of the stream."""
         names = CORRECTIONS | (GAIN if self._gain else {})
         # rounding may put a sample just before its stretch
         bins = np.floor(t * self._rate + 1e-6).astype(np.int64)
@@ -321,10 +323,10 @@ class Corrector:
 
 class Follower:
     """
-    Moves a wanted motion by what the stage is off, so that the stage goes where it is wanted.
+    Corrects a wanted motion by the measured error of the stage.
 
-    What a model makes of the corrected motion is that motion; the stage adds offset, creep and
-    gain to it.
+    A stage differs from its model by an offset, creep and a gain.  The follower subtracts them
+    from the wanted motion before the inverse of the model makes the voltage.
 
     Parameters
     ----------
@@ -357,27 +359,27 @@ class Follower:
         self.corrector.set_model(model)
         self._stream, self._known = stream or model.stream(), known
         self._newest = -np.inf
-        # what is applied of what the stage adds [m], and of its gain
+        # the offset [m] and the gain that are corrected now
         self._offset = self._gain = 0.0
         self.is_limited = False
 
     def drove(self, t: Array, v: Array) -> None:
-        """Take the voltage [V] that left, with its time [s]; at least one sample."""
+        """Take the voltage [V] that was sent, with its time [s]; at least one sample."""
         self._newest = float(t[-1])
         prediction = Samples(t, self._stream.process(v, t))
         self.corrector.predicted(prediction, Samples(t, v), self._known)
 
     def measured(self, samples: Samples) -> None:
-        """Take a block of displacement; what is no number, or ahead of the voltage, is none."""
+        """Take a block of displacement; samples that are NaN or ahead of the voltage are ignored."""
         usable = np.isfinite(samples.values) & (samples.t <= self._newest)
         if usable.any():
             self.corrector.measured(samples.t[usable], samples.values[usable])
 
     def process(self, wanted: Array, lead: int) -> Array:
         """
-        Return the next samples of a wanted motion [m], corrected; shapes (n,).
+        Correct the next samples of a wanted motion [m]; shapes (n,).
 
-        The first of them is wanted `lead` samples behind the last voltage.
+        The first sample is wanted `lead` samples after the last voltage.
         """
         n, s = wanted.size, self._model.scaling
         offset, gain = self.corrector.ahead(lead + n - 1, 1)

@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The safety contract of the node that drives the amplifier, judged on the voltage applied.
+Keep the voltage of an amplifier within its limits and its slew.
 
-Whatever command comes in - out of range, jumping, not a number, stopping, starting over - the
-voltage that goes out stays within its limits and its slew:
+A command may be out of range, jump, hold NaN, stop, or start over.  The guard answers:
 
-- a command that is in order passes bit for bit;
-- one outside the limits is applied at the limit, one that jumps is followed at the slew;
-- a sample that is no number leaves the last command in force;
-- when no command comes any more, the caller asks `Guard.idle` for a soft ramp to rest;
-- a new stream joins softly: the distance between what is applied and what is commanded fades out
-  along a raised cosine, while the command is followed.
+- it passes a correct command bit for bit;
+- it applies the limit for a command outside the limits, and follows a jump at the slew;
+- it repeats the last command for a sample that is NaN or infinite;
+- it ramps softly to rest while no command comes and the caller asks `Guard.idle`;
+- it joins a new stream softly: the distance between the applied and the commanded voltage fades
+  out along a raised cosine.
 
-The simulated stage and the excitation use it, and so should a driver of real hardware.
+The simulated stage and the excitation use the guard; a driver of real hardware should, too.
 """
 
 from __future__ import annotations
@@ -28,30 +27,30 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.kernel import kernel
 
-#: how long the ramp of a node that is ending may take [s]
+#: longest ramp to rest of a node that shuts down [s]
 LAST_RAMP = 0.7
-#: why a sample was altered, in the order of the kernel's counts
+#: reasons for altering a sample, in the order of the counts of the kernel
 REASONS = ('not_finite', 'outside_limits', 'too_fast', 'joining')
 
-# the state of a guard that its kernel changes
+# indices of the state of a guard, which its kernel changes
 _APPLIED, _COMMAND, _OFFSET, _DONE, _LENGTH, _PENDING = range(6)
 
 
 @dataclass(frozen=True)
 class GuardSettings:
     """
-    What a guard holds to.
+    Limits of a guard.
 
     Parameters
     ----------
     low, high : float
         Limits [V].
     slew : float
-        Steepest voltage that is ever applied [V/s].
+        Steepest change of the applied voltage [V/s].
     ramp_slew : float
         Top speed of the ramps to rest and into a new stream [V/s].
     rest : float
-        Where a silent drive goes [V].
+        Voltage of a drive without a command [V].
     sample_rate : float
         [Hz]
 
@@ -103,15 +102,15 @@ class GuardSettings:
 @dataclass(frozen=True, eq=False)
 class Applied:
     """
-    What became of a block of command.
+    Applied voltage for a block of command.
 
     Attributes
     ----------
     voltage : ndarray, shape (n,)
-        What is applied [V]; the command itself where nothing was wrong.
+        Applied voltage [V]; equals the command if the command is correct.
     altered : mapping of str to int
-        How many samples were altered, by reason: ``not_finite``, ``outside_limits``, ``too_fast``,
-        ``joining``; empty when none was.
+        Number of altered samples by reason: ``not_finite``, ``outside_limits``, ``too_fast``,
+        ``joining``; empty without altered samples.
     """
 
     voltage: NDArray[np.float64]
@@ -133,7 +132,7 @@ def _follow(
         x = v[k]
         if not np.isfinite(x):
             counts[0] += 1
-            # the limits may have been moved since
+            # the limits may have changed since the last command
             x = min(max(state[_COMMAND], low), high)
         else:
             if x < low or x > high:
@@ -164,13 +163,13 @@ def _follow(
 
 class Guard:
     """
-    Makes of a command what may be applied; how it is cut into blocks changes no bit.
+    Turns a command into a safe voltage; the size of the blocks changes no bit of it.
 
     Parameters
     ----------
     settings : GuardSettings
-        May be replaced at any time; an applied voltage outside new limits moves back into them at
-        the slew, also in a gap and before a ramp to rest.
+        They may be replaced at any time.  An applied voltage outside new limits moves back inside
+        at the slew, also in a gap and before a ramp to rest.
     applied : float, optional
         The voltage applied so far [V]; rest when absent.
 
@@ -185,19 +184,19 @@ class Guard:
 
     def __init__(self, settings: GuardSettings, applied: float | None = None) -> None:
         start = settings.rest if applied is None else float(applied)
-        # a command that is no number before the first one that is: stay where we are
+        # NaN before the first command repeats the start voltage
         self._state = np.array([start, start, 0.0, 0.0, 0.0, 1.0])
         self._settings = settings
-        # start and length in samples of the ramp to rest, and how much of it is done
+        # start [V] and length of the ramp to rest, and samples of it that are done
         self._ramp: tuple[float, int, int] | None = None
         # whether nothing has been commanded since the last silence
         self._idled = False
-        # compiles, so that the first block does not have to wait
+        # compiles the kernel, so that the first block need not wait
         self.process(())
 
     @property
     def settings(self) -> GuardSettings:
-        """What is held to."""
+        """Limits of the guard."""
         return self._settings
 
     @settings.setter
@@ -217,14 +216,14 @@ class Guard:
 
     def process(self, command: ArrayLike, restarted: bool = False) -> Applied:
         """
-        Return what may be applied of the next stretch of command.
+        Make the applied voltage for the next block of command.
 
         Parameters
         ----------
         command : array_like, shape (n,)
             [V]
         restarted : bool, optional
-            Whether a new stream begins here; after `idle` one always does.
+            Whether a new stream begins here.  A stream after `idle` is always new.
         """
         v = np.ascontiguousarray(command, dtype=np.float64)
         state, settings = self._state, self._settings
@@ -241,12 +240,12 @@ class Guard:
         return Applied(out, altered)
 
     def hold(self, n: int) -> NDArray[np.float64]:
-        """Return what is applied while `n` samples of a stream are missing: the last voltage."""
+        """Repeat the last voltage for `n` missing samples, first moving back into new limits."""
         back = self._back_inside(n)
         return np.concatenate([back, np.full(n - back.size, self.applied)])
 
     def _back_inside(self, n: int) -> NDArray[np.float64]:
-        """Return up to `n` samples of the way back into limits that were moved."""
+        """Move back into changed limits at the slew, for up to `n` samples."""
         settings, start = self._settings, self.applied
         limit = min(max(start, settings.low), settings.high)
         if limit == start or not n:
@@ -254,7 +253,7 @@ class Guard:
         most = min(n, math.ceil(abs(limit - start) / settings.step) + 1)
         steps = np.full(most + 1, math.copysign(settings.step, limit - start))
         steps[0] = start
-        # one after the other, so that it does not matter how the time is cut
+        # summed one by one, so that the size of the blocks changes no bit
         way = np.add.accumulate(steps)[1:]
         there = np.flatnonzero(way <= limit if limit < start else way >= limit)
         if there.size:
@@ -265,15 +264,14 @@ class Guard:
 
     def idle(self, n: int, longest: float = math.inf) -> NDArray[np.float64]:
         """
-        Return what is applied while no command comes: a soft ramp to rest, and then rest.
+        Make the voltage for `n` samples without a command: a soft ramp to rest, then rest.
 
         Parameters
         ----------
         n : int
             Number of samples.
         longest : float, optional
-            Time within which rest must be reached [s], though never faster than the slew allows;
-            looked at when the ramp begins.
+            Longest ramp [s], fixed when the ramp begins.  The slew still limits its speed.
 
         Returns
         -------
@@ -297,7 +295,7 @@ class Guard:
         k = np.arange(done + 1, done + n + 1)
         tau = np.minimum(k / max(length, 1), 1.0)
         shape = tau - np.sin(2 * np.pi * tau) / (2 * np.pi)
-        # rest itself, not what rounding leaves of it
+        # exactly rest, free of rounding
         voltage = np.where(k >= length, rest, start + (rest - start) * shape)
         self._ramp = (start, length, done + n)
         self._state[_APPLIED] = voltage[-1]

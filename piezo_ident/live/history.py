@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a voltage leaves behind: enough to bring a new model into the state it would have.
+Keep as much of a voltage as the state of any new model depends on.
 
-The plays remember extremes of the voltage as far back as the start of the run, but only few of
-them: a loop inside a later stroke leaves no trace (the wiping-out property).  The remaining
-turning points, with the samples just before each, and the last seconds in full are enough.
+A new model takes over in the state that it would have if it had run from the start.  Its plays
+remember extremes of the voltage since the start of the run.  A loop inside a later stroke leaves
+no trace in them (the wiping-out property), so only a few turning points matter.  The history keeps
+these turning points, the samples just before each, and the last seconds in full.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from piezo_ident.record.blocks import Samples
 
 #: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
-#: time before each turning point of which the samples are kept [s]
+#: time before each turning point in which samples are kept [s]
 APPROACH = 0.05
-#: most blocks that are kept
+#: most blocks that are kept in full
 MOST_BLOCKS = 100_000
 
 
 class Recalling(Protocol):
-    """What can be brought into its state after a past voltage."""
+    """A run whose plays can be set by a past voltage."""
 
     def recall(self, v: NDArray[np.float64], t: NDArray[np.float64]) -> None:
-        """Take its plays through it."""
+        """Move the plays along v [V] at the times t [s]."""
 
 
 @kernel
 def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
-    # indices of the first and last sample, and of those at which the direction changes
+    # writes the indices of first and last sample and of each change of direction
     n, before = 0, 0.0
     for k in range(v.size):
         after = np.sign(v[k + 1] - v[k]) if k + 1 < v.size else np.nan
@@ -50,10 +51,10 @@ def _turns(v: NDArray[np.float64], out: NDArray[np.int64]) -> int:
 
 class TurningPoints:
     """
-    The part of a voltage's history that determines the memory of any play operator.
+    Turning points of a voltage that determine the memory of any play operator.
 
-    Of four turning points in a row, the inner two are dropped when they lie between the outer
-    two.  The first point always stays.
+    Four turning points in a row lose the inner two if these lie between the outer two.  The first
+    point always stays.
 
     Examples
     --------
@@ -95,7 +96,7 @@ class TurningPoints:
         self._tail = Samples(t[first[-1] :], v[first[-1] :])
 
     def copy(self) -> TurningPoints:
-        """Return another one that goes on by itself."""
+        """Return an independent copy."""
         other = TurningPoints()
         other._points, other._tail = self._points.copy(), self._tail
         return other
@@ -109,8 +110,8 @@ class TurningPoints:
         """
         Return time [s] and voltage [V] of a path through the turning points.
 
-        For operators that depend on the speed.  The samples before each point are those that were
-        measured; short straight lines connect them.
+        Operators that depend on the speed need it.  The path holds the recorded samples before
+        each point, connected by short straight lines.
 
         Parameters
         ----------
@@ -136,7 +137,7 @@ class TurningPoints:
 
 class History:
     """
-    A voltage since the start of a run: its turning points, and its last seconds in full.
+    Voltage since the start of a run: its turning points, and its last seconds in full.
 
     Attributes
     ----------
@@ -166,7 +167,7 @@ class History:
             self._old.add(*recent.popleft())
 
     def snapshot(self) -> History:
-        """Return it as it is now, for another thread."""
+        """Copy the history for another thread."""
         copy = History()
         copy._old, copy._recent = self._old.copy(), self._recent.copy()
         copy.count = self.count
@@ -176,7 +177,7 @@ class History:
         self, run: Recalling, model: StageModel, period: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """
-        Take a fresh run of a model through what is long ago; return the rest to go through.
+        Set a fresh run by the old part of the voltage; return the recent part.
 
         Parameters
         ----------
@@ -188,8 +189,9 @@ class History:
         Returns
         -------
         t, v : ndarray, shape (n,)
+            Time [s] and voltage [V] of the recent part, which the caller has to run through.
         """
-        # without older samples the recent ones are the whole run
+        # without an old part the recent part is the whole run
         if len(self._old):
             if model.effects_in('input') or model.effects_in('hysteresis'):
                 t, v = self._old.path(period)
@@ -202,7 +204,7 @@ class History:
         return t, v
 
     def since(self, count: int) -> NDArray[np.float64]:
-        """Return the voltage of the last samples, those behind the first `count`."""
+        """Return the voltage after the first `count` samples [V], as far as it is kept in full."""
         missing, parts = self.count - count, [np.empty(0)]
         for _, v in reversed(self._recent):
             if missing <= 0:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A motion that is repeated on a running stage: what to send, what came back, what was learned."""
+"""Learn a repeated motion on a running stage: voltage, measurement and next voltage."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from piezo_ident.live.guard import GuardSettings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
-#: time at the first voltage of a repetition before it begins [s]
+#: wait at the first voltage before a repetition begins [s]
 SETTLE = 0.05
 
 
 class LiveLearning:
     """
-    The repetitions of one reference.
+    Repetitions of one reference.
 
     Parameters
     ----------
@@ -35,10 +35,9 @@ class LiveLearning:
     model : StageModel
     reference : ndarray
     voltage : ndarray, shape (m,)
-        What to send next, from rest on [V]; the way from rest to its first voltage is for the
-        guard to make.
+        Voltage of the next repetition [V].  The guard makes the ramp from rest to its first value.
     wanted : ndarray, shape (m,)
-        Where the stage is wanted then [m]; NaN before the motion.
+        Wanted displacement at the same samples [m]; NaN before the motion.
 
     Raises
     ------
@@ -59,13 +58,13 @@ class LiveLearning:
         way = math.ceil(2.0 * abs(drive.v[0] - s.rest) / s.ramp_step)
         self._first = way + round(SETTLE * s.sample_rate)
         self.voltage = np.append(np.full(self._first, drive.v[0]), drive.v)
-        # that of the drive is corrected by what was learned
+        # the reference itself: the motion of the drive holds the learnt correction
         wanted = np.pad(self.reference, (drive.lead, 0), mode='edge')
         self.wanted = np.append(np.full(self._first, np.nan), wanted)
         self._measured = np.full(drive.v.size, np.nan)
 
     def measured(self, samples: Samples, tick: int) -> None:
-        """Take a block of displacement, of a clock on which the repetition began at a tick."""
+        """Take a block of displacement; `tick` is the first sample of the repetition."""
         k = np.rint(samples.t * self._settings.sample_rate).astype(np.int64) - tick - self._first
         inside = (k >= 0) & (k < self._measured.size)
         self._measured[k[inside]] = samples.values[inside]
@@ -82,10 +81,10 @@ class LiveLearning:
 
     @property
     def is_done(self) -> bool:
-        """Whether the error falls no more."""
+        """Whether the error has stopped to fall."""
         return self._learning.is_done
 
     def take(self) -> None:
-        """Learn from what was measured, and plan the next repetition: with the best voltage."""
+        """Learn from the measured displacement, and plan the next repetition."""
         self._learning.take(self._measured)
         self.again()

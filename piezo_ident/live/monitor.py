@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Measured and predicted blocks: joined on time, binned for display, compared by their rms."""
+"""Join measured and predicted blocks on time, bin them for display, and compare them by rms."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from piezo_ident.record.readings.jumps import AROUND, least_step, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
-#: after this time without a match, two streams are taken to be in the same run [s]
+#: time of waiting blocks without a match, after which both streams count as in one run [s]
 CATCH_UP = 1.0
 #: largest number of waiting blocks
 MOST = 500
-#: number of bins after which a late quantity is no longer waited for
+#: number of bins by which a late quantity may hold up the others
 LAG = 25
-#: share of the mean square of what is left that goes with the displacement, to tell it as a gain
-#: that is not followed (taste)
+#: share of the mean square of the residual that a wrong gain must explain to be reported (taste)
 EXPLAINED = 0.5
-#: samples on either side by which a reading is judged
+#: samples on either side that decide whether a reading is wild
 EDGE = AROUND + 4
 
 
@@ -45,7 +44,7 @@ class Matched:
 
     @property
     def residual(self) -> Samples:
-        """The residual as a block."""
+        """The residual as a block [m]."""
         return Samples(self.t, self.y - self.y_hat, self.segment, 'displacement')
 
 
@@ -63,7 +62,7 @@ class _Side:
         return float(self.waiting[-1].t[-1] - self.waiting[0].t[0]) if self.waiting else 0.0
 
     def forget(self) -> int:
-        """Drop blocks that have waited too long, and return their number of samples."""
+        """Drop blocks that have waited too long; return their number of samples."""
         kept = [s for s in self.waiting if self.clock.last - s.t[-1] <= WAIT][-MOST:]
         n = sum(s.t.size for s in self.waiting) - sum(s.t.size for s in kept)
         self.waiting = kept
@@ -114,13 +113,13 @@ class Matcher:
         if kind is Kind.START:
             own.waiting.clear()
             if not own.clock.restarts or other.run > own.run:
-                # the second of the two to start or restart has only caught up
+                # the other stream has started or restarted before; this one catches up
                 own.run = other.run
             else:
                 own.run += 1
         pairs, rest = [], new
         if own.run != other.run and own.span > CATCH_UP:
-            # one of them was silent when the clock restarted
+            # one stream was silent when the clock restarted
             own.run = other.run = max(own.run, other.run)
         for one in list(other.waiting) if own.run == other.run else ():
             if not rest.t.size:
@@ -160,7 +159,7 @@ class PreviewBin:
 
 
 class Preview:
-    """Bins of sample time, `rate` a second; each waits until every quantity has passed it."""
+    """Bins of sample time, `rate` per second; a bin is complete once all quantities passed it."""
 
     def __init__(self, rate: float = 50.0) -> None:
         self.rate = rate
@@ -172,7 +171,7 @@ class Preview:
         """
         Take samples of a quantity; return the bins that are complete now, in order.
 
-        What is not a finite number is left out.
+        NaN and infinite numbers are left out.
         """
         finite = np.isfinite(x) & np.isfinite(t)
         if not finite.all():
@@ -217,12 +216,12 @@ class Preview:
 
 class TrackingError:
     """
-    Wanted minus measured displacement, as blocks of both come.
+    Wanted minus measured displacement, block by block.
 
     Parameters
     ----------
     window : float
-        Time over which it is taken [s].
+        Time over which the rms is taken [s].
 
     Attributes
     ----------
@@ -234,7 +233,7 @@ class TrackingError:
         self._low, self._high = np.inf, -np.inf
 
     def wanted(self, samples: Samples) -> list[Samples]:
-        """Take a block of what is wanted; return the errors that it completes."""
+        """Take a block of wanted displacement; return the errors that it completes."""
         if not samples.t.size:
             return []
         self._low = min(self._low, float(samples.values.min()))
@@ -247,12 +246,12 @@ class TrackingError:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether the displacement of what was wanted is still to come."""
+        """Whether wanted blocks still wait for their measured displacement."""
         return self._matcher.is_waiting
 
     @property
     def percent(self) -> float | None:
-        """Its rms [% of the span that was wanted]; None before there is one."""
+        """Rms of the error [% of the span of the wanted motion]; None before the first error."""
         return percent(self.live.rms, self._high - self._low) if self.live.seconds else None
 
     def _errors(self, pairs: list[Matched]) -> list[Samples]:
@@ -268,7 +267,7 @@ class LiveError:
     """
     Mean and rms of the residual over a window of sample time [s], and its slope.
 
-    Wild readings are left out, as offline, where they are few.
+    Wild readings are left out if they are few, by the rule for records.
     """
 
     def __init__(self, window: float) -> None:
@@ -278,22 +277,22 @@ class LiveError:
 
     def clear(self) -> None:
         """Forget all samples."""
-        # begin and end of each stretch; number and sums of what is kept, and wild
+        # begin and end of each block, its sums of kept readings, and its sums of wild readings
         self._parts: deque[tuple[float, float, Array, Array]] = deque()
         self._step = np.inf
         self._forget_last()
 
     def _forget_last(self) -> None:
-        # error and measured displacement that came last, and how many of them are judged
+        # the newest errors and measured displacements, and how many of them are judged
         self._last, self._judged = np.empty((2, 0)), 0
 
     def add(
         self, t: Array, residual: Array, stroke: float = np.inf, measured: Array | None = None
     ) -> None:
         """
-        Take the residual [m] of the next samples, of a stage of some stroke [m].
+        Take the residual [m] of the next samples; `stroke` is that of the stage [m].
 
-        What was `measured` [m] tells the codes of a coarse sensor.
+        The `measured` displacement [m] reveals the step of a coarse sensor.
         """
         finite = np.isfinite(residual)
         e = residual[finite]
@@ -314,7 +313,7 @@ class LiveError:
             self._parts.popleft()
 
     def _sorted(self, new: Array, stroke: float) -> tuple[Array, Array]:
-        """Return the sums of what is kept and of what is wild, of all that has neighbours."""
+        """Sum kept and wild readings of all samples that have enough neighbours to be judged."""
         e, y = new
         wild = np.zeros(e.size, dtype=bool)
         if np.isfinite(stroke):
@@ -331,7 +330,7 @@ class LiveError:
     def _sums(self) -> tuple[Array, int]:
         sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 7).sum(axis=0)
         kept, out = sums[0], sums[1]
-        # what happens often is the way of the stage
+        # frequent wild readings are real motion of the stage
         if out[0] > MAX_WILD * (kept[0] + out[0]):
             return kept + out, 0
         return kept, int(out[0])
@@ -360,10 +359,11 @@ class LiveError:
 
     def gain(self, span: float) -> tuple[float, float]:
         """
-        Return the slope of the residual against what was predicted, and its standard deviation.
+        Fit the slope of the residual over the prediction; return it with its standard deviation.
 
-        The slope is that of least squares beside a mean.  What it leaves is correlated along the
-        path of the displacement, so that a path of twice that length is one value.
+        Least squares fit the slope and a mean.  The remaining error is correlated along the path
+        of the displacement over a length of `PATH` spans.  A path of twice this length counts as
+        one independent value.
 
         Parameters
         ----------
@@ -373,14 +373,15 @@ class LiveError:
         Returns
         -------
         tuple of float
-            An infinite standard deviation where the residual does not go with the prediction, or
-            the stage did not move by the length of that correlation.
+            Slope and standard deviation.  The standard deviation is infinite if the slope explains
+            less than `EXPLAINED` of the residual, or if the stage moved by less than the
+            correlation length.
         """
         (n, e, ee, p, pp, pe, path), _ = self._sums()
         if n < 2.0:
             return 0.0, np.inf
         ee, pp, pe = ee / n - (e / n) ** 2, pp / n - (p / n) ** 2, pe / n - e * p / n**2
-        # a uniform motion by that length
+        # a uniform motion over the correlation length has this variance
         if 12.0 * pp < (PATH * span) ** 2:
             return 0.0, np.inf
         slope, left = pe / pp, ee - pe**2 / pp
@@ -391,6 +392,6 @@ class LiveError:
 
 
 def _sums_of(e: Array, p: Array) -> Array:
-    """Return number, sums and products of errors and predictions, and the path of these."""
+    """Number, sums and products of errors and predictions, and the path of the predictions."""
     path = np.abs(np.diff(p)).sum()
     return np.array([e.size, e.sum(), e @ e, p.sum(), p @ p, p @ e, path])

@@ -1,40 +1,40 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""When each block is due, and when it arrived, whatever happens to the clock of the machine."""
+"""Time the sending and the arrival of blocks, even if somebody sets the clock of the machine."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import time
 
-#: a block this much behind its time is not caught up with: readers keep only so many blocks [s]
+#: delay of a block that is not made up: readers keep only so many blocks [s]
 SLIP = 0.25
-#: the clock was set when it moved by more, which is less than a block [ns]
+#: smallest jump of the clock that means that it was set; less than the time of a block [ns]
 STEP = 500_000
 
 
 class Schedule:
     """
-    The schedule of a stream, counted from its start so that it cannot drift.
+    Schedule of a stream, counted from its start so that it cannot drift.
 
     Parameters
     ----------
     speed : float
-        Progress in a second: samples, or seconds of a recording.
+        Progress per second: samples, or seconds of a recording.
     start : float
         When position 0 is due, on a monotonic clock [s].
     slip : float, optional
-        Delay from which on the rest of the schedule moves instead of being caught up with [s].
+        Largest delay that is made up; a larger one moves the rest of the schedule [s].
 
     Attributes
     ----------
     sent, late : int
-        Blocks, and how many of them were sent after the next one was due.
+        Number of blocks, and number of blocks sent after the next block was due.
     worst : float
         Largest delay of a block [s].
     slipped : float
-        By how much the schedule was moved after long delays [s].
+        Time by which long delays have moved the schedule [s].
 
     Examples
     --------
@@ -71,16 +71,16 @@ class Schedule:
 
 class Pace:
     """
-    How many samples are due in real time, from one look to the next.
+    Number of samples due in real time since the last look.
 
-    After a pause of the process the stream goes on where it was.
+    After a long pause of the process the stream goes on where it was.
 
     Parameters
     ----------
     rate : float
         Samples a second.
     longest : float
-        Time that is caught up with at most [s].
+        Longest time that one look makes up [s].
     """
 
     def __init__(self, rate: float, longest: float) -> None:
@@ -96,10 +96,10 @@ class Pace:
 
 class Looks:
     """
-    Regular looks of a process at what it waits for.
+    Time-outs of a process that looks regularly for messages.
 
-    A process that gets no time from the machine hears nothing meanwhile, and what was sent still
-    waits for it.  A wait is therefore over only where an earlier look fell into its second half.
+    A busy machine may stop the process for a while; messages sent meanwhile wait unread.  A wait
+    is therefore over only if the look before the last also came after more than half of the limit.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class Looks:
         self._before, self._now = self._now, time.monotonic()
 
     def is_over(self, since: float, limit: float) -> bool:
-        """Return whether nothing came for longer than a limit [s], on time.monotonic."""
+        """Return whether the time from `since` (time.monotonic) exceeds a limit [s]."""
         return self._now - since > limit and self._before - since > 0.5 * limit
 
 
@@ -118,18 +118,18 @@ class ArrivalClock:
     """
     Times of arrival that go on evenly when somebody sets the clock of the machine.
 
-    A bag is read in the order of its log times: a clock that was set back would mix what came
-    after with what came before.
+    A bag is read in the order of its log times.  Times from a clock that was set back would
+    interleave later messages with earlier messages.
 
     Parameters
     ----------
     wall, steady : callable, optional
-        The clock that may be set, by which arrivals are stamped, and one that cannot be [ns].
+        The clock that stamps arrivals and may be set, and a clock that cannot be set [ns].
 
     Attributes
     ----------
     set_by : int
-        By how much the clock was set since the beginning [ns].
+        Time by which the clock was set since the beginning [ns].
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class ArrivalClock:
         self._now = 0
 
     def look(self) -> None:
-        """Look whether the clock was set; to be called before arrivals are stamped."""
+        """Detect whether the clock was set; call it before arrivals are stamped."""
         moved = self._measured() - self._offset
         self._before = self.set_by
         if abs(moved - self.set_by) > STEP:
@@ -158,20 +158,20 @@ class ArrivalClock:
 
     def stamp(self, arrival: int) -> int:
         """Return the log time of an arrival since the last look but one [ns]."""
-        # before the step the old clock was in force; nothing comes from the future
+        # an arrival before the jump has the old time; no arrival lies in the future
         ways = (arrival - self.set_by, arrival - self._before)
         now = self._now
         return min(ways, key=lambda stamp: (stamp - now > 4 * STEP, abs(stamp - now)))
 
 
 class Rate:
-    """How fast a count grows, from one look to the next."""
+    """Growth of a count per second, from one look to the next."""
 
     def __init__(self) -> None:
         self._at, self._count = time.monotonic(), 0.0
 
     def of(self, count: float) -> float:
-        """Return the growth a second since the last look; 0 where it started over."""
+        """Return the growth per second since the last look; 0 if the count started over."""
         now = time.monotonic()
         rate = max(0.0, count - self._count) / max(now - self._at, 1e-3)
         self._at, self._count = now, count

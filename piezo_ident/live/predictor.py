@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The prediction beside a running stage: block by block, through gaps, restarts and new models.
+Predict the displacement of a running stage, through gaps, restarts and new models.
 
 `piezo_ident.live.history` brings a new model into the state that it would have if it had run from
 the start.
@@ -25,9 +25,9 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples, time_problem
 from piezo_ident.record.record import Piece
 
-#: longest gap that is bridged by a straight line; after a longer one a new run starts [s]
+#: longest gap that a straight line bridges; a longer gap starts a new run [s]
 BRIDGE = 0.5
-#: share of the voltage range that counts as its lower end, where the memory is known
+#: share of the voltage range that counts as its lower end; a stage there has a known memory
 REST = 0.01
 
 
@@ -59,7 +59,7 @@ class Predictor:
 
     @property
     def late(self) -> int:
-        """Samples that arrived again or out of order, and were left out."""
+        """Samples that came again or out of turn, and were left out."""
         return self._clock.late
 
     @property
@@ -72,7 +72,7 @@ class Predictor:
         """
         Whether the memory of the plays is known.
 
-        It is when the voltage has been at its lowest since the start of the run or the last gap.
+        The lower end of the voltage range makes it known, until the next gap or new run.
         """
         return self.model is not None and bool(self.model.scaling.u(self._lowest) < REST)
 
@@ -88,7 +88,8 @@ class Predictor:
         Raises
         ------
         ModelError
-            When its sampling rate differs from that of the stream, or it needs a further channel.
+            When its sampling rate differs from the rate of the stream, or when one of its effects
+            needs a further channel.
         """
         for setting in model.effects:
             if setting.channel:
@@ -112,7 +113,7 @@ class Predictor:
         )
 
     def caught_up(self, model: StageModel) -> Stream:
-        """Return a run of a model under the voltage so far; at rest where there was none."""
+        """Run a model under the voltage so far; without voltage it is at rest."""
         stream = model.stream()
         if not self._past:
             return stream
@@ -122,16 +123,16 @@ class Predictor:
 
     def process(self, samples: Samples) -> Samples | None:
         """
-        Return the prediction for a block, or None.
+        Predict the displacement for a block; None if the block is left out or no model fits it.
 
-        A gap of up to half a second is bridged by a straight line; after a longer one, and after
-        a restart, the stage is taken to be at rest.  Repeated and late blocks, and blocks with
-        NaN or infinite numbers, are left out.
+        A straight line bridges a gap of up to half a second.  A longer gap and a restart begin a
+        new run, with the stage at rest.  Repeated and late blocks, and blocks with NaN or infinite
+        numbers, are left out.
 
         Parameters
         ----------
         samples : Samples
-            Of voltage.
+            Voltage [V].
         """
         # copies, since the message may change
         t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
@@ -165,7 +166,7 @@ class Predictor:
         if problem := time_problem(t):
             self.problem = f'a block of voltage is left out: {problem}'
         elif not np.isfinite(v).all():
-            # counted when the gap that it leaves is met
+            # its samples count as missing once the next block shows the gap
             self.problem = (
                 f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
                 'it is left out'

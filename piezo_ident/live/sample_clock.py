@@ -2,21 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The sample-clock tracker: follows one stream of blocks by its time stamps and its publisher.
+Follow one stream of blocks by its time stamps and its publisher.
 
-A node that drives an amplifier from blocks must know whether a block goes on where the last one
-ended, starts over, comes twice or too late, or belongs to another publisher.
+A node that drives an amplifier must know how a block relates to its stream.  The block may go on
+where the last block ended, start over, come twice or too late, or belong to another publisher.
+Some middleware does not say which publisher sent a message.  rclpy gives the number that the
+publisher counted for the message, and the ids of all publishers of the topic.  The rules are:
 
-Some middleware does not tell which publisher sent a message; rclpy tells the message's number in
-the count of its publisher, and which publishers there are.  So:
-
-- while the publisher that was there at the start is the only one, every message is its own;
-- beside another one only a message with the next number is its own, and only while no other
-  publisher is known to be at that number; without numbers, only one with the next time;
-- where another one is at that number and at that time, as one that started at the same moment,
-  nobody can tell whose a message is, and it is refused;
-- behind a silence the publisher may come back, and another one once the first has gone, or behind
-  `SampleClock.end`.
+- If the topic has had one publisher since the start, every message belongs to it.
+- If others have come, a message belongs to the followed publisher if it has its next number, and
+  no other publisher is known to be at that number.  Messages without numbers are compared by time.
+- If another publisher is at the same number and the same time, because both started together, the
+  message is refused, for its sender is unknown.
+- After a silence the followed publisher may come back.  Another publisher is followed once the
+  first has gone, or after `SampleClock.end`.
 """
 
 from __future__ import annotations
@@ -34,28 +33,28 @@ from piezo_ident.record.clock import has_restarted
 #: returns the ids of all publishers of a topic
 Publishers = Callable[[], Collection[Hashable]]
 
-#: blocks whose repetition is recognised, gaps into which a late block may belong, and other
-#: publishers whose count is known
+#: number of blocks whose repetition is recognised, of gaps that late blocks may belong to, and of
+#: other publishers whose count is remembered
 MEMORY = 8
-#: how far a stamp may lie off its tick, in samples
+#: largest distance of a time stamp from its tick [samples]
 SLACK = 1e-3
 
 
 class Kind(enum.Enum):
-    """What a block is to a stream."""
+    """Relation of a block to its stream."""
 
-    NEXT = 'next'  # goes on where the last one ended
-    START = 'start'  # a new stream, or one that starts over
-    GAP = 'gap'  # the same stream, after samples that are missing
-    REPEAT = 'repeat'  # came before
-    LATE = 'late'  # its time has passed
-    SECOND = 'second'  # of another publisher, while the followed stream is alive
-    MALFORMED = 'malformed'  # its time stamps are not those of a block
+    NEXT = 'next'  # it goes on where the last block ended.
+    START = 'start'  # it begins a new stream, or the stream starts over.
+    GAP = 'gap'  # it belongs to the stream, after missing samples.
+    REPEAT = 'repeat'  # the same block came before.
+    LATE = 'late'  # its time has passed.
+    SECOND = 'second'  # another publisher sent it, while the followed stream is alive.
+    MALFORMED = 'malformed'  # its time stamps are not consecutive ticks.
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a block is: its first tick, the samples missing before it, and a reason for people."""
+    """Relation of a block, its first tick, samples missing before it, and a reason for people."""
 
     kind: Kind
     tick: int = 0
@@ -64,7 +63,7 @@ class Verdict:
 
     @property
     def is_taken(self) -> bool:
-        """Whether the block belongs to what is followed."""
+        """Whether the block belongs to the followed stream."""
         return self.kind in (Kind.NEXT, Kind.START, Kind.GAP)
 
 
@@ -77,12 +76,12 @@ class SampleClock:
     sample_rate : float
         [Hz]
     longest_gap : float
-        A stream that misses more than this is a new one [s].
+        Longest gap within a stream; a longer gap begins a new stream [s].
 
     Attributes
     ----------
     head : int or None
-        The tick expected next; None while no stream is followed, or the one followed is silent.
+        Next expected tick; None before a stream begins and while it is silent.
 
     Examples
     --------
@@ -104,12 +103,12 @@ class SampleClock:
         self.end()
 
     def pause(self) -> None:
-        """Take note of a silence: only the publisher that is followed may come back."""
+        """Note a silence: only the followed publisher may come back while it exists."""
         self._is_silent = self._is_silent or self.head is not None
         self._forget()
 
     def end(self) -> None:
-        """Follow nobody any more: the next block of any publisher starts a stream."""
+        """Stop following the stream: the next block of any publisher begins a stream."""
         self._is_silent = False
         self._owner: Hashable = None
         self._is_alone = True
@@ -121,11 +120,11 @@ class SampleClock:
         self._again: int | None = None
         self._seen: deque[tuple[int, bytes]] = deque(maxlen=MEMORY)
         self._holes: deque[tuple[int, int]] = deque(maxlen=MEMORY)
-        #: next number and tick of the other publishers that have sent beside this stream
+        #: next number and tick of other publishers that have sent during this stream
         self._rivals: deque[tuple[int, int]] = deque(maxlen=MEMORY)
 
     def skip(self, sequence: int | None) -> None:
-        """Count a message that holds no block."""
+        """Count a message without a readable block."""
         if sequence is None or self._is_next(sequence):
             self._sequence = sequence
         else:
@@ -135,16 +134,17 @@ class SampleClock:
         self, samples: Samples, sequence: int | None = None, publishers: Publishers = tuple
     ) -> Verdict:
         """
-        Return what the next block is.
+        Decide how the next block relates to the stream.
 
         Parameters
         ----------
         samples : Samples
         sequence : int, optional
-            Number that its publisher gave the message, where the middleware tells.
+            Number that its publisher gave the message; None if the middleware does not tell.
         publishers : callable, optional
-            Returns the ids (gids) of all publishers of the topic; called only where a block does
-            not simply go on.  No id at all means one publisher.
+            Returns the ids (gids) of all publishers of the topic.  It is called only if a block
+            does not simply go on, or if others were present at the start.  No ids mean one
+            publisher.
         """
         ticks, reason = self._ticks(samples.t)
         if reason:
@@ -193,20 +193,20 @@ class SampleClock:
     # whose it is
 
     def _is_next(self, sequence: int) -> bool:
-        """Return whether a number is the next one of the followed publisher, and of no other."""
+        """Return whether a number is next for the followed publisher and for no other."""
         return self._sequence is None or (
             sequence == self._sequence + 1 and sequence not in self._others
         )
 
     def _note_other(self, sequence: int | None) -> None:
         if sequence is not None:
-            # a number that may be of either stays known as the other's
+            # a number that either may have sent remains among the numbers of the other
             if sequence in self._others and sequence - 1 != self._sequence:
                 self._others.remove(sequence)
             self._others.append(sequence + 1)
 
     def _is_foreign(self, tick: int, sequence: int | None, publishers: Publishers) -> bool:
-        """Return whether a block is another publisher's, or may be."""
+        """Return whether another publisher sent a block, or may have sent it."""
         if self.head is None and not self._is_silent:
             return False  # any publisher is followed
         numbered = sequence is not None and self._sequence is not None
@@ -223,12 +223,12 @@ class SampleClock:
         if self._is_alone and (not ids or set(ids) == {self._owner}):
             return False
         if self._owner is not None and ids and self._owner not in ids:
-            # it has gone; its last blocks may still be on their way
+            # the followed publisher has gone; its last blocks may still arrive
             return not self._is_silent
         return not numbered or sequence is None or not self._is_next(sequence)
 
     def _start(self, tick: int, sequence: int | None, publishers: Publishers) -> None:
-        """Begin a stream, of the same publisher or of a new one."""
+        """Begin a stream of the followed publisher or of a new publisher."""
         if self.head is None:
             ids = publishers()
             is_same = self._is_silent and (not ids or self._owner is None or self._owner in ids)
@@ -244,7 +244,7 @@ class SampleClock:
         self._forget()
         self._begin = tick
 
-    # what it is to the stream
+    # relation to the stream
 
     def _at(self, tick: int) -> str:
         return f'at t = {tick / self.sample_rate:.6g} s'
@@ -259,7 +259,7 @@ class SampleClock:
         if missing > 0:
             kind = Kind.GAP if missing <= self.longest_gap * self.sample_rate else Kind.START
             return Verdict(kind, tick, missing, f'{missing} samples are missing {at}')
-        # two in a row that were there before are no repetition but the stream once more
+        # two consecutive blocks that came before mean that the stream starts over
         if tick != self._again:
             if (tick, samples.values.tobytes()) in self._seen:
                 return Verdict(Kind.REPEAT, tick, reason=f'the block {at} came twice')

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-From a reference to a voltage, block by block: joined softly, within the limits, model after model.
+Turn a reference into a voltage, block by block, through new references and new models.
 
-A reference that begins, or another one, is joined from where the stage is along a raised cosine,
-in metres.  A new model takes over in the state that it would have if it had run from the start;
-the reference is then joined from where that model says that the stage is, so that the voltage does
-not jump.  What leaves has passed a guard on the voltage.
+The tracker joins a new reference along a raised cosine in metres, from the position of the stage.
+A new model takes over in the state that it would have if it had run from the start.  The tracker
+then joins the reference from the position that the new model predicts, so the voltage does not
+jump.  A guard limits the voltage in the end.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from piezo_ident.record.blocks import Samples
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    What leaves for a block of a reference.
+    Voltage for a block of a reference.
 
     Attributes
     ----------
     t, v, wanted : ndarray, shape (n,)
-        Time of the voltage's clock [s], voltage [V], and where the stage is wanted then [m].
+        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
     clipped : int
-        Samples at which a limit keeps the stage from there.
+        Number of samples at which a limit keeps the stage from the wanted displacement.
     """
 
     t: Array
@@ -51,7 +51,7 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Successor:
-    """A model that has been brought up to `count` samples of voltage, and a run of it."""
+    """Inverse of a new model after `count` samples of voltage, and a free run of the model."""
 
     inverse: LiveInverse
     count: int
@@ -70,15 +70,15 @@ class Tracker:
     settings : GuardSettings
         At the rate of the model.
     preview : int, optional
-        Samples by which the stage follows later.
+        Samples by which the stage follows the reference later.
     follow : {'off', 'offset', 'gain'}, optional
-        What the voltage makes up for of what displacement tells: nothing, offset and creep of
-        earlier motion, or the gain of the stage besides.
+        Corrections by measured displacement: none, offset and creep from earlier motion, or these
+        and the gain of the stage.
 
     Attributes
     ----------
     follower : Follower or None
-        None where it makes up for nothing.
+        Corrects the wanted motion; None if `follow` is ``'off'``.
 
     Raises
     ------
@@ -109,7 +109,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Be at rest, with the clock of the voltage at zero."""
+        """Begin at rest, with the clock of the voltage at zero."""
         self._guard, self._past = Guard(self.settings), History()
         self._inverse.reset()
         start = self._inverse.position
@@ -132,7 +132,7 @@ class Tracker:
 
     @property
     def tick(self) -> int:
-        """Samples that have left."""
+        """Samples sent so far."""
         return self._past.count
 
     @property
@@ -152,27 +152,27 @@ class Tracker:
         )
 
     def _step(self) -> float:
-        """Return the largest change of a ramp from one sample to the next [m]."""
+        """Return the largest change from one sample of a ramp to the next [m]."""
         scaling = self._inverse.model.scaling
         return self.settings.ramp_step * abs(scaling.Y / scaling.V)
 
     def process(self, reference: ArrayLike, restarted: bool = False) -> Drive:
         """
-        Return the voltage for the next samples of a reference.
+        Make the voltage for the next samples of a reference.
 
-        A sample that is no number leaves the last one in force.
+        A sample that is NaN or infinite repeats the last sample.
 
         Parameters
         ----------
         reference : array_like, shape (n,)
             [m]
         restarted : bool, optional
-            Whether another stream begins here, which is to be joined.
+            Whether a new stream begins here, which has to be joined.
 
         Returns
         -------
         Drive
-            Of as many samples, each for the reference `preview` samples before.
+            As many samples of voltage; each belongs to the reference `preview` samples before.
         """
         raw = np.asarray(reference, dtype=np.float64)
         if raw.ndim != 1 or not raw.size:
@@ -188,32 +188,32 @@ class Tracker:
         return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
 
     def _corrected(self, wanted: Array) -> Array:
-        """Return a wanted motion as the model must move for the stage to be there."""
+        """Correct a wanted motion by the measured error of the stage."""
         if self.follower is None:
             return wanted
         return self.follower.process(wanted, self.preview + 1)
 
     def measured(self, samples: Samples) -> None:
-        """Take displacement [m] of times of the voltage."""
+        """Take a block of displacement [m], on the clock of the voltage."""
         if self.follower is not None:
             self.follower.measured(samples)
 
     def finish(self) -> Drive:
-        """Return the voltage for what of the reference is still ahead; its last sample stays."""
+        """Make the voltage for the rest of the reference, whose last sample is repeated."""
         return self.process(np.full(self.preview, self._raw[-1]))
 
     def play(self, v: Array) -> tuple[Array, Array]:
-        """Return time and voltage for a voltage that is given, joined and limited."""
+        """Send a given voltage, joined softly and limited; return its time and voltage."""
         v = self._guard.process(v).voltage
         return self._sent(v), v
 
     def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
-        """Return time and voltage of the next samples of a ramp to rest; see `Guard.idle`."""
+        """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
         v = self._guard.idle(n, longest)
         return self._sent(v), v
 
     def hurry(self) -> None:
-        """Let the next ramp to rest be looked at anew, one that is under way too."""
+        """Begin a ramp to rest anew, so that `idle` can shorten it."""
         self._guard = Guard(self.settings, self._guard.applied)
 
     def _sent(self, v: Array) -> Array:
@@ -229,7 +229,7 @@ class Tracker:
 
     def successor(self, model: StageModel, past: History) -> Successor:
         """
-        Return a model in the state that it would have by now; from any thread.
+        Bring a model into the state after the voltage so far; any thread may call this.
 
         Parameters
         ----------
@@ -248,12 +248,12 @@ class Tracker:
         return Successor(inverse, past.count, run)
 
     def past(self) -> History:
-        """Return a snapshot of the voltage so far; from any thread."""
+        """Return a snapshot of the voltage so far; any thread may call this."""
         with self._lock:
             return self._past.snapshot()
 
     def take_over(self, successor: Successor) -> None:
-        """Go on with another model, from where it says that the stage is."""
+        """Go on with another model, from the position that it predicts."""
         self._inverse = successor.inverse
         if not self.tick:
             self.reset()
@@ -266,7 +266,7 @@ class Tracker:
                 t = np.arange(successor.count, self.tick) / self.settings.sample_rate
                 run.process(v, t)
         self.follower = self._new_follower(run)
-        # the voltage is on its way: so must the wanted motion be
+        # the voltage is moving, so the joined motion must move from its first sample
         self._join = _Join(self._inverse.position, self._step(), moves=True)
         self._wanted = self._join.process(self._raw)
         self._inverse.process(self._wanted)
@@ -274,7 +274,7 @@ class Tracker:
 
 def held(x: Array, before: float) -> Array:
     """
-    Return samples, each that is no number replaced by the one before it.
+    Replace each NaN or infinite sample by the sample before it.
 
     >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
     [3.0, 1.0, 1.0]
@@ -287,13 +287,13 @@ def held(x: Array, before: float) -> Array:
 
 
 def bridged(x: Array, before: float, missing: int) -> Array:
-    """Return samples behind a straight line over those that are missing before them."""
+    """Put a straight line for the missing samples before a block."""
     share = np.arange(1, missing + 1) / (missing + 1)
     return np.append(before + (x[0] - before) * share, x)
 
 
 def check_unit(model: StageModel, x: Array) -> None:
-    """Refuse a block of a reference that is nowhere near the stage, with a DataError."""
+    """Refuse a block of a reference that lies far beyond the stage, with a DataError."""
     s = model.scaling
     least = float(np.nanmin(np.abs(x - s.y0), initial=np.inf))
     if FAR * abs(s.Y) < least < np.inf:
@@ -310,12 +310,12 @@ class _Join:
     Parameters
     ----------
     start : float
-        Where the stage is [m].
+        Position of the stage [m].
     step : float
         Largest change by the cosine from one sample to the next [m].
     moves : bool, optional
-        Whether it is on its way along the reference: then what parts it from there fades out.
-        From rest it is the motion that fades in, which leaves no range that both are in.
+        Whether the stage already moves along the reference.  The distance between them then fades
+        out.  From rest the reference fades in instead, so the sum never leaves the range of both.
 
     Attributes
     ----------
@@ -330,7 +330,7 @@ class _Join:
         self._distance = 0.0
 
     def process(self, x: Array) -> Array:
-        """Return the next samples; one that is no number leaves the last one in force."""
+        """Join the next samples; a sample that is NaN or infinite repeats the last sample."""
         x = held(x, self._command)
         self._command = float(x[-1])
         if self._length < 0:
