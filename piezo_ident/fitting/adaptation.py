@@ -2,24 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a model learns slowly of a stage that runs: its gain, and on request its hysteresis.
+Learn the gain of a running stage slowly, and on request its hysteresis.
 
-The displacement is that of the free run, plus theta_j times what each of a few changes of the
-model adds: its gain; the weights of its plays, by hats over their thresholds; its cubic; the
-shares of its creep.  Each is a run of a changed model of its own, so that amplifier, creep, G and
-delay do to it what they do to the stage.  All of that and what was measured pass a high-pass,
-which leaves offset, drift and creep of earlier motion to the observer.
+The learnt displacement is the free run plus the sum of theta_j f_j.  f_j is the response to one
+change of the model: of its gain, of the weights of its plays (hats over their thresholds), of its
+cubic, or of the shares of its creep.  A changed model runs for each f_j, so amplifier, creep, G
+and delay act on the change as they act on the stage.  A high-pass removes offset, drift and creep
+of earlier motion from the f_j and from the measured error; the observer corrects these.
 
-theta is found by recursive least squares over the means f of groups of samples, which forget what
-they tell of anew, theta_j by theta_j, and no further than to what was known before:
+Recursive least squares fit theta to the means f of groups of samples.  Old information fades only
+for the theta_j that a group informs about, and never below the information of the prior:
 
     L <- A L A + (1 - A^2) L0 + f f' / R,      A_j^2 = 1 - (1 - mu) s_j / (s_j + e R)
 
-L is the information, L0 the diagonal one of the prior, s_j = f_j^2 / L0_jj.  A stage at rest tells
-of nothing, and nothing is forgotten.  What theta must keep (weights of plays >= 0, a rising H,
-sizes that a stage may have) are half-spaces, onto which it is moved along L^-1.  What is far from
-all that was learnt is not believed before it has lasted for longer than the high-pass remembers
-a step of the sensor; then as little is known of the stage as at first.
+L is the information, L0 the diagonal information of the prior, s_j = f_j^2 / L0_jj.  A stage at
+rest informs about no theta_j, so theta is kept.  Half-spaces bound theta: the weights of the plays
+stay positive, H rises, and each change has a plausible size.  A theta outside of a half-space
+moves onto it along L^-1.  Measurements far from the prediction are refused at first.
+They mean another stage if they last for `PATIENCE`, after which the high-pass has forgotten a step
+of the sensor.  The information then returns to the prior.
 
 J. E. Parkum, N. K. Poulsen and J. Holst, "Recursive forgetting algorithms", Int. J. Control 55(1),
 1992, doi:10.1080/00207179208934228.
@@ -41,40 +42,40 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.hysteresis import Hysteresis
 
-#: what is learnt
+#: learnt part of the model
 Learns = Literal['off', 'gain', 'hysteresis']
-#: makes of a model a run under the voltage so far
+#: turns a model into a run that has seen the voltage so far
 Recalled: TypeAlias = Callable[[StageModel], Stream]
 
 #: time over which samples are averaged to one measurement [s]
 GROUP = 2e-3
 #: time constant of the high-pass [s]: below it lie scans, above it drift and slow creep (taste)
 SLOW = 0.1
-#: time of motion after which what was measured counts by 1 / e [s]: five of them are the 10 s in
-#: which a change is to be learnt, with a spare
+#: time of motion after which a measurement counts by 1 / e [s]: a change shall be learnt within
+#: 10 s, which are more than five of these times
 MEMORY = 1.5
-#: time for which what is not believed must last until it is [s]: the high-pass has forgotten a
+#: time of refused measurements after which they are believed [s]: the high-pass has forgotten a
 #: step of the sensor by then
 PATIENCE = 6.0 * SLOW
 #: hats over the thresholds (taste: as many as the wider laws of H have)
 HATS = 5
-#: rms size of what is learnt: of weights, of the cubic in normalised units, of the shares of creep
+#: rms size of each change: of weights, of the cubic in normalised units, of the shares of creep
 #: (taste: a third)
 WEIGHTS, CUBIC, CREEP = 0.3, 0.1, 0.3
-#: most of each, in these sizes (taste)
+#: largest change, in these sizes (taste)
 LARGEST = 3.0
-#: share of the weights of plays, and of the slope of H, that is left at least (taste)
+#: smallest remaining share of a weight of a play, and of the slope of H (taste)
 LEFT = 0.1
-#: places over the span at which the slope is watched
+#: number of places over the span at which the slope of H is bounded
 PLACES = 9
-#: size of a drift, as what it leaves behind the high-pass, in spans: creep of a hundredth a
-#: decade, half a second after a step over the range
+#: size of a drift behind the high-pass, in spans.  A drift of 1e-2 spans per second is creep of a
+#: hundredth per decade, half a second after a step over the range
 DRIFT = SLOW * 1e-2
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """A change of a model by one: its name, what the model becomes, and its rms size."""
+    """A change of a model by one unit: its name, the changed model, and its rms size."""
 
     name: str
     model: StageModel
@@ -98,7 +99,7 @@ def _changes(model: StageModel, kind: Learns) -> Iterator[Change]:
 
 
 def _grown(h: Hysteresis, share: Array) -> Hysteresis:
-    """Return H whose plays weigh more by a share each, curves and bias with them."""
+    """Increase the weights of the plays of H by a share each, with their curves and bias."""
     more = 1.0 + share
     return replace(
         h,
@@ -109,7 +110,7 @@ def _grown(h: Hysteresis, share: Array) -> Hysteresis:
 
 
 def _creeping(model: StageModel, times: float) -> StageModel:
-    """Return a model that creeps more, by a factor."""
+    """Multiply the creep of a model by a factor."""
     effects = []
     for effect in model.effects:
         if effect.name == Creep.name:
@@ -123,17 +124,17 @@ class Adaptation:
     """
     Learns changes of a model from displacement that comes a horizon later.
 
-    The result does not depend on how a stream is cut.
+    The result does not depend on the size of the blocks.
 
     Parameters
     ----------
     model : StageModel
     kind : {'gain', 'hysteresis'}
-        What is learnt; the hysteresis includes the gain.
+        Learnt part of the model; the hysteresis includes the gain.
     horizon : int, optional
-        Samples by which displacement is older than what is said with it.
+        Samples by which displacement is older than the free run that it corrects.
     recalled : callable, optional
-        Makes of a model a run under the voltage so far; at rest when absent.
+        Turns a model into a run that has seen the voltage so far; at rest when absent.
     """
 
     def __init__(
@@ -153,7 +154,7 @@ class Adaptation:
         sizes = np.array([change.size for change in self._changes])
         keep = np.exp(-1.0 / (SLOW * model.sample_rate))
         self._law = np.array([size**2, keep, np.exp(-1.0 / groups[0]), groups[1], GATE**2])
-        # a drift stands behind what is learnt
+        # the last unknown is a drift
         self._prior = np.diag(np.append(sizes, DRIFT) ** -2.0)
         rows = self._half_spaces(sizes)
         self._halves = np.insert(rows, sizes.size, 0.0, axis=1)
@@ -161,14 +162,14 @@ class Adaptation:
         self.begin(recalled)
 
     def _half_spaces(self, sizes: Array) -> Array:
-        """Return rows a and b of what theta must keep: a theta >= b."""
+        """Return the bounds of theta as rows of a and b: a theta >= b."""
         h, n = self.model.hysteresis, sizes.size
         names = [change.name for change in self._changes]
         least = -LARGEST * sizes
         weights = np.array([float(name.startswith('weights')) for name in names])
         gain = np.array([float(name == 'gain') for name in names])
         rows = [*np.column_stack([np.eye(n), least]), *np.column_stack([-np.eye(n), least])]
-        # of plays: a weight grows by gain and hat
+        # a weight of a play grows by the gain and by its hat
         rows += [np.append(np.eye(n)[k] + gain, LEFT - 1.0) for k in np.flatnonzero(weights)]
         v = np.linspace(*h.span, PLACES)
         before = h.slope_at_turns(v)
@@ -178,13 +179,13 @@ class Adaptation:
         return np.array(rows)
 
     def restore(self) -> None:
-        """Forget what was learnt."""
+        """Return to the given model."""
         self._theta = np.zeros(len(self._changes) + 1)
         self._information, self._now = self._prior.copy(), np.zeros(kernel.PLACES)
         self._now[kernel.SCALE] = 1.0
 
     def begin(self, recalled: Recalled = StageModel.stream) -> None:
-        """Begin another run; what was learnt stays."""
+        """Begin another run with the learnt changes."""
         n = len(self._changes) + 1
         self._runs = [recalled(change.model) for change in self._changes]
         self._past = np.full((n, self.horizon), np.nan)
@@ -193,19 +194,19 @@ class Adaptation:
 
     @property
     def seconds(self) -> float:
-        """Time of motion that was learnt from [s]."""
+        """Time of motion that the model has learnt from [s]."""
         return float(self._now[kernel.LEARNT]) * self._group / self.model.sample_rate
 
     @property
     def learnt(self) -> dict[str, tuple[float, float]]:
-        """Each change by its name, with its standard deviation."""
+        """Learnt changes by name, each with its standard deviation."""
         std = np.sqrt(np.diag(np.linalg.inv(self._information)))
         rows = zip(self._changes, self._theta.tolist(), std.tolist(), strict=False)
         return {change.name: (value, s) for change, value, s in rows}
 
     @property
     def told(self) -> dict[str, float]:
-        """What was learnt of the gain, and of the width of the loop, as shares."""
+        """Relative changes of the gain and of the width of the loop."""
         learnt = {name: x for name, (x, _) in self.learnt.items()}
         share, q = self._weights(learnt), self.model.hysteresis.weights
         found = {'learnt/gain': learnt['gain']}
@@ -214,14 +215,14 @@ class Adaptation:
         return found
 
     def _weights(self, learnt: dict[str, float]) -> Array | None:
-        """Return the share by which each play weighs more, beside the gain."""
+        """Return the relative change of each weight of a play, without that of the gain."""
         hats = [x for name, x in learnt.items() if name.startswith('weights')]
         r = self.model.hysteresis.thresholds
         return np.interp(r, np.linspace(r[0], r[-1], len(hats)), hats) if hats else None
 
     @property
     def learnt_model(self) -> StageModel:
-        """The model with what was learnt, and its history."""
+        """The learnt model, with an entry of the changes in its identification."""
         model, changes = self.model, {name: x for name, (x, _) in self.learnt.items()}
         gain, h = 1.0 + changes['gain'], model.hysteresis
         share = self._weights(changes)
@@ -244,18 +245,18 @@ class Adaptation:
         self, v: Array, t: Array, free: Array, measured: Array, sound: bool = True
     ) -> Array:
         """
-        Return the free run of the model that was learnt, for the next samples [m], shape (n,).
+        Run the learnt model freely over the next samples [m], shape (n,).
 
         Parameters
         ----------
         v, t : ndarray, shape (n,)
             Voltage [V] and its time [s].
         free : ndarray, shape (n,)
-            Free run of the model as given [m].
+            Free run of the given model [m].
         measured : ndarray, shape (n,)
-            Displacement of `horizon` samples before each [m], NaN where there is none.
+            Displacement `horizon` samples before each sample [m]; NaN if it is missing.
         sound : bool, optional
-            Whether the free run is to be learnt from; not while plays are unknown.
+            Whether to learn from these samples; False while outputs of plays are unknown.
         """
         Y, s = self.model.scaling.Y, self.model.scaling
         new = np.stack([s.x(free), *[(run.process(v, t) - free) / Y for run in self._runs]])

@@ -9,23 +9,22 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import ordered_kernel
 
-#: share of the variance of a measurement from which on it tells anything
+#: smallest signal of a measurement that is used, as a share of its variance
 TELLS = 1e-2
-#: share of the measurements that are not believed for a while without that they mean another stage
+#: share of refused measurements that is tolerated; more of them mean another stage in the end
 RARE = 0.1
 
-# places of the numbers in `now`: samples and finite ones of the group, measurements that are not
-# believed, scale of the variance, measurements that were learnt from, and what the changes add
-# where the stage is on average
+# places in `now`: samples of the group, finite samples of it, refused measurements, scale of the
+# variance, used measurements.  PIVOT is the learnt displacement at the average position
 COUNT, FINITE, REFUSED, SCALE, LEARNT, PIVOT, PLACES = range(7)
-# places in `law`: variance, what the high-pass keeps, what is not forgotten, groups of patience,
-# and gate
+# places in `law`: variance of a measurement, decay of the high-pass in a sample, decay of old
+# information in a group, groups of patience, squared gate
 ERROR, KEEP, KEPT, PATIENCE, GATE = range(5)
 
 
 @ordered_kernel
 def _invert(a: Array, out: Array) -> None:
-    # of a positive definite matrix, by Gauss and Jordan: no pivots are needed
+    # Gauss-Jordan; a positive definite matrix needs no search for pivots
     n = a.shape[0]
     work = a.copy()
     out[:, :] = 0.0
@@ -46,7 +45,7 @@ def _invert(a: Array, out: Array) -> None:
 
 @ordered_kernel
 def _times(a: Array, x: Array, out: Array) -> float:
-    # a x, and x a x
+    # writes a x, returns x a x
     total = 0.0
     for i in range(x.size):
         out[i] = 0.0
@@ -58,7 +57,7 @@ def _times(a: Array, x: Array, out: Array) -> float:
 
 @ordered_kernel
 def _constrain(theta: Array, P: Array, halves: Array, way: Array) -> None:
-    # the worst one first, a few times: the half-spaces meet at zero
+    # corrects the most violated half-space, at most ten times; theta = 0 fulfils all of them
     n = theta.size
     for _ in range(10):
         worst, at = 0.0, -1
@@ -73,7 +72,7 @@ def _constrain(theta: Array, P: Array, halves: Array, way: Array) -> None:
         share = worst / _times(P, halves[at, :n], way) * (1.0 + 1e-9)
         for i in range(n):
             theta[i] -= way[i] * share
-    # no point was found along the way: what lies nearer to the model as given is allowed
+    # no allowed point was found: go halfway back to the given model
     for i in range(n):
         theta[i] *= 0.5
 
@@ -89,7 +88,7 @@ def _take(
     information: Array,
     now: Array,
 ) -> None:
-    # one measurement e of f theta
+    # takes one measurement e = f theta
     n, power, patience = f.size, now[SCALE] * law[ERROR], law[PATIENCE]
     told, off = 0.0, e
     for i in range(n):
@@ -105,14 +104,14 @@ def _take(
         now[REFUSED] += 1.0
         if now[REFUSED] < patience:
             return
-        # another stage: as little is known of it as at first
+        # another stage: return to the prior
         information[:, :] = prior
         now[REFUSED] = 0.0
-        # or one that the model lacks something of, which then counts as error
+        # or the model lacks an effect of the stage, which then counts as error
         now[SCALE] *= 2.0
     else:
         now[REFUSED] = max(0.0, now[REFUSED] - RARE)
-        # slowly, or a step would count as such an error
+        # the scale grows slowly, or a step would count as such an error
         now[SCALE] = max(1.0, now[SCALE] * (1.0 + RARE**2 * (score - 1.0) / patience))
     now[LEARNT] += 1.0
     power = now[SCALE] * law[ERROR]
@@ -148,9 +147,10 @@ def learn(
     out: Array,
 ) -> None:
     """
-    Take y, and free run and changes of a horizon before; write what the changes of now add.
+    Learn from y and the free run a horizon before; write the learnt displacement of now to `out`.
 
-    The first row of `before` and `new` is the free run, the others are what a change adds.
+    The first row of `before` and `new` is the free run.  Each further row is the response to one
+    change of the model.
     """
     n, keep = theta.size - 1, law[KEEP]
     for k in range(y.size):
@@ -171,7 +171,7 @@ def learn(
                 f[:n] = mean[:n]
                 old = theta.copy()
                 _take(mean[n], f, law, prior, halves, theta, information, now)
-                # what is learnt turns the motion about its middle: a zero is for the observer
+                # a change of theta keeps the average position: the observer corrects the zero
                 for i in range(n):
                     now[PIVOT] += (theta[i] - old[i]) * slow[i]
             sums[:] = 0.0

@@ -40,7 +40,7 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
     ----------
     record : Record
     sent : mapping of str to float, optional
-        Time [s] of each kind of segment in the voltage.  It reveals samples that are missing at
+        Time [s] of each kind of segment in the voltage, which reveals samples that are missing at
         either end of the record.
 
     Raises

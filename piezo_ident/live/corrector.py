@@ -370,7 +370,7 @@ class Follower:
         self.corrector.predicted(prediction, Samples(t, v), self._known)
 
     def measured(self, samples: Samples) -> None:
-        """Take a block of displacement; samples that are NaN or ahead of the voltage are ignored."""
+        """Take a block of displacement; NaN and samples ahead of the voltage are ignored."""
         usable = np.isfinite(samples.values) & (samples.t <= self._newest)
         if usable.any():
             self.corrector.measured(samples.t[usable], samples.values[usable])

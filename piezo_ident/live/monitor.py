@@ -392,6 +392,6 @@ class LiveError:
 
 
 def _sums_of(e: Array, p: Array) -> Array:
-    """Number, sums and products of errors and predictions, and the path of the predictions."""
+    """Sum errors, predictions and their products; count them and add up the path of p."""
     path = np.abs(np.diff(p)).sum()
     return np.array([e.size, e.sum(), e @ e, p.sum(), p @ p, p @ e, path])

@@ -9,11 +9,11 @@ where the last block ended, start over, come twice or too late, or belong to ano
 Some middleware does not say which publisher sent a message.  rclpy gives the number that the
 publisher counted for the message, and the ids of all publishers of the topic.  The rules are:
 
-- If the topic has had one publisher since the start, every message belongs to it.
-- If others have come, a message belongs to the followed publisher if it has its next number, and
-  no other publisher is known to be at that number.  Messages without numbers are compared by time.
-- If another publisher is at the same number and the same time, because both started together, the
-  message is refused, for its sender is unknown.
+- Every message belongs to the followed publisher while the topic has no other publisher.
+- Later a message belongs to the followed publisher if it carries the next number.  No other
+  publisher may be known to be at that number.  Messages without numbers are compared by time.
+- Two publishers that start together are at the same number and time.  Their messages cannot be
+  told apart and are refused.
 - After a silence the followed publisher may come back.  Another publisher is followed once the
   first has gone, or after `SampleClock.end`.
 """
@@ -43,13 +43,13 @@ SLACK = 1e-3
 class Kind(enum.Enum):
     """Relation of a block to its stream."""
 
-    NEXT = 'next'  # it goes on where the last block ended.
-    START = 'start'  # it begins a new stream, or the stream starts over.
-    GAP = 'gap'  # it belongs to the stream, after missing samples.
-    REPEAT = 'repeat'  # the same block came before.
-    LATE = 'late'  # its time has passed.
-    SECOND = 'second'  # another publisher sent it, while the followed stream is alive.
-    MALFORMED = 'malformed'  # its time stamps are not consecutive ticks.
+    NEXT = 'next'  # The block goes on where the last block ended.
+    START = 'start'  # The block begins a new stream, or the stream starts over.
+    GAP = 'gap'  # The block belongs to the stream, after missing samples.
+    REPEAT = 'repeat'  # The same block came before.
+    LATE = 'late'  # The time of the block has passed.
+    SECOND = 'second'  # Another publisher sent the block, while the followed stream is alive.
+    MALFORMED = 'malformed'  # The time stamps are not consecutive ticks.
 
 
 @dataclass(frozen=True)

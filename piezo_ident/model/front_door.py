@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Methods of a model that answer one question: how well, which parameters, which dynamics."""
+"""Answer questions to a model: prediction, error, inverse, parameters and dynamics."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ModelParameter:
     part : str
         H, G, delay, or the name of an effect.
     name, unit : str
-        Symbol of the paper or name of the effect's parameter; units of an effect are those of the
+        Symbol of the paper, or name of the parameter of an effect.  An effect has the units of the
         normalised chain, in which 1 is the full span.
     value : float or str
     std : float or None
@@ -269,7 +269,7 @@ def _number(value: Any) -> float | None:
 
 
 def _with_std(part: str, name: str, values: Array, stds: Any) -> list[ModelParameter]:
-    """Rows of a list of coefficients; deviations of another length are those of another fit."""
+    """Rows of a list of coefficients; deviations of another length belong to another fit."""
     known = (
         stds if isinstance(stds, Sequence) and len(stds) == values.size else [None] * values.size
     )

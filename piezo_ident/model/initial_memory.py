@@ -2,23 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a stage keeps of its motion before a record: the memory of the plays, and creep.
+Estimate the state of a stage at the start of a record: the memory of its plays, and its creep.
 
-The memory is known where the record starts at the lowest voltage, and comes back to its
-displacement there.  Elsewhere each play keeps its unknown start F_r(0) as long as the voltage
-allows,
+The memory is known if the record starts at the lowest voltage and comes back to its displacement
+there.  Otherwise each play keeps its unknown start F_r(0) as long as the voltage allows,
 
-    max(v so far) - r   <=   F_r(0)   <=   min(v so far),
+    max(v so far) - r   <=   F_r(0)   <=   min(v so far).
 
-so the starts are a few bounded numbers, which least squares finds from the early part of the
-record.  Once the voltage has swept the width of a play, the play depends on its start no more.
+The starts are thus a few bounded numbers, which least squares fit to the early part of the record.
+A play no longer depends on its start once the voltage has swept the width of the play.
 
-Lags along the path start anywhere between the least and the largest value that they follow.  What
-they add by it decays along the path, ``exp(-a_j s)``: they are more numbers of the same problem.
-
-So is what each element of creep still has to go, ``c_i d_i exp(-t / tau_i)``, of a model that has
-creep.  A sensor that was set to zero elsewhere looks like slow creep.  The zero is therefore free
-first; it is held where creep within the range explains the record as well without it.
+Lags along the path start between the smallest and the largest value that they follow.  Their
+contribution decays along the path as ``exp(-a_j s)``, so their starts are further numbers of the
+same problem.  A model with creep adds the remaining creep of each element,
+``c_i d_i exp(-t / tau_i)``.  A shifted zero of the sensor looks like slow creep.  The zero is
+therefore fitted, too, at first.  It is then held at the zero of the model if creep within the
+range explains the record as well.
 """
 
 from __future__ import annotations
@@ -35,38 +34,40 @@ from piezo_ident.record.readings.suspicions import rises_first
 from piezo_ident.record.record import Piece, Record
 from scipy.optimize import lsq_linear
 
-#: share of its range that the voltage must sweep until the start is forgotten
+#: share of its range that the voltage sweeps until the start counts as forgotten
 SHARE = 0.98
-#: and of the range of a model that is enough: wider plays are few, and stand where the early part
-#: says
+#: share of the range of a model that is enough for this: the few wider plays keep the start that
+#: the early part gave
 SWEPT = 0.8
-#: share of a lag's start that may be left where it is forgotten
+#: share of the start of a lag that remains when it counts as forgotten
 LEFT = 0.05
-#: samples that are searched together
+#: number of samples that are searched at once
 WINDOW = 1 << 18
-#: linear steps towards the memory, at most
+#: most linear steps towards the memory
 TRIALS = 20
-#: weight of the memory of a stage that came down to zero, as a share of the weight of the data
+#: weight of the prior, the memory of a stage that came down to zero, as a share of the data's
+#: weight
 PULL = 1e-4
-#: the same of lags along the path: of several, together, far smaller sums are seen
+#: the same for lags along the path: the data show much smaller sums of several lags
 LAG_PULL = 1e-6
-#: the same of creep, for a start that is off by the range of H: some elements are hardly seen
+#: the same for creep, for a start that is off by the range of H: the data hardly show some
+#: elements
 CREEP_PULL = 1e-8
-#: farthest that a sensor's zero may have moved, in spans
+#: largest shift of the zero of a sensor, in spans
 FAR = 1e3
-#: share of a record from which creep of earlier motion is estimated, at least
+#: smallest share of a record from which creep of earlier motion is estimated
 EARLY = 0.2
-#: a stage had not come down to the lowest voltage where a start at rest errs by so many times as
-#: much on the early part as behind it, and by this share of the span, and another start leaves
-#: this share of it (taste: creep that a model lacks shows early, too, but not as much)
+#: a start at rest is rejected if three conditions hold.  Its error on the early part is ERRS times
+#: the error after it, and SEEN spans.  Another start reduces the error to LEAVES of it (taste:
+#: creep that a model lacks also shows early, but less)
 ERRS, SEEN, LEAVES = 5.0, 1e-3, 0.2
-#: rms that creep of earlier motion must leave there, over that without it, the zero free
+#: largest rms error with creep of earlier motion and a free zero, over the rms error without both
 WORTH = 0.9
-#: and what it must gain, in spans
+#: reduction of the rms error that creep must bring beyond this, in spans
 FAINT = 1e-5
-#: rms that it may leave with the zero of the model, over that with a free zero
+#: largest rms error with creep and the zero of the model, over the rms error with a free zero
 SURE = 1.1
-#: rms that creep must leave there beside a zero that moved, over that without creep
+#: largest rms error with creep and a shifted zero, over the rms error without both
 APART = 0.3
 
 
@@ -74,26 +75,25 @@ def forgotten(
     u: NDArray[np.float64], share: float = SHARE, way: float = 0.0, enough: float = np.inf
 ) -> int:
     """
-    Return the first sample at which the voltage has swept a share of its range, or enough.
+    Find the first sample at which the voltage has swept a share of its range, or enough.
 
-    Plays that are not wider than that then no longer depend on their start.  Lags need a long
-    path, too.
+    Plays up to this width then no longer depend on their start.  Lags need a long path, too.
 
     Parameters
     ----------
     u : ndarray, shape (n,)
         Voltage in any unit.
     share : float, optional
-        Of the range of `u`.
+        Share of the range of `u` to sweep.
     way : float, optional
-        Path that the voltage must travel, too, in its unit; `forgetting` of a model.
+        Path that the voltage must travel as well, in the unit of `u`; see `forgetting`.
     enough : float, optional
-        What it is enough to sweep, in its unit.
+        Sweep that is enough in any case, in the unit of `u`.
 
     Returns
     -------
     int
-        The number of samples where the path is shorter.
+        Index of the sample; the number of samples if the voltage never gets there.
     """
     goal = min(share * float(np.ptp(u)), enough)
     low, high, gone = np.inf, -np.inf, 0.0
@@ -123,7 +123,7 @@ def is_at_rest(model: StageModel, piece: Piece) -> bool:
 
 
 def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
-    """Return a warning where the voltage alone does not tell the memory at the start."""
+    """Return a warning if the voltage alone does not determine the memory at the start."""
     v = [pieces[0].v[0] for pieces in connected_pieces(record) if not is_at_rest(model, pieces[0])]
     if not v:
         return ()
@@ -141,9 +141,9 @@ def begins_at_rest(
     model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
 ) -> bool:
     """
-    Return whether a piece starts near the lowest voltage, and goes on as if it had come down.
+    Return whether a piece starts near the lowest voltage, and fits a start at rest there.
 
-    A stage that rises for the first time errs there, and no more once the start is forgotten.
+    A stage whose plays had not come down errs at first, until the start is forgotten.
     """
     if not is_at_rest(model, piece):
         return False
@@ -162,10 +162,11 @@ def begins_at_rest(
 
 
 def early_part(model: StageModel, piece: Piece, *, memory: bool) -> int:
-    """Return the number of samples from which creep, or the `memory`, before is estimated."""
+    """Return the number of samples that serve to estimate the creep, or the `memory`."""
     creeps, end = _creeps(model), 10
     if memory:
-        # later, what was before the start is forgotten; wide plays and creep look alike
+        # later samples no longer depend on the start; with creep, sweep for wide plays, too, which
+        # look like creep
         enough = np.inf if creeps else SWEPT * float(np.ptp(model.scaling.range))
         end = max(forgotten(piece.v, way=forgetting(model), enough=enough), end)
     if creeps:
@@ -177,20 +178,20 @@ def fit_start(
     model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
 ) -> Start | None:
     """
-    Estimate what a stage keeps of its motion before a piece.
+    Estimate the state of a stage at the start of a piece.
 
     Parameters
     ----------
     model : StageModel
     piece : Piece
-        With short gaps bridged, as of `piezo_ident.record.readings.gaps.bridged`.
+        Piece with short gaps bridged by `piezo_ident.record.readings.gaps.bridged`.
     sound : ndarray of bool, shape (n,), optional
-        Its samples that were measured; all when absent.
+        Samples that were measured; all when absent.
 
     Returns
     -------
     Start or None
-        None for a stage that was at rest at the lowest voltage, as far as the data tell.
+        None if the data agree with rest at the lowest voltage.
     """
     known = begins_at_rest(model, piece, sound)
     creeps = _creeps(model)
@@ -205,21 +206,22 @@ def fit_start(
     held, e_held = _fit(model, piece, sound, memory=not known, creep=True)
     if np.sqrt(np.mean(e_held**2)) <= SURE * np.std(left):
         return held
-    # a zero and slow creep make up for each other: what the model lacks looks like both
+    # Zero and slow creep compensate each other, and an error of the model looks like their sum.
+    # Only a sum that explains most of the error is therefore accepted.
     if np.std(left) <= APART * np.std(e):
         return free
     return None if known else still
 
 
 def crept(model: StageModel, start: Start) -> float:
-    """Return what creep of earlier motion adds to the displacement at a start [m]."""
+    """Return the displacement by creep of earlier motion at a start [m]."""
     if not start.creep.size:
         return 0.0
     return float(model.scaling.Y * model.dynamics.gain * (creep_elements(model)[0] @ start.creep))
 
 
 def creep_elements(model: StageModel) -> NDArray[np.float64]:
-    """Return shares and time constants [s] of the creep of a model, shape (2, c)."""
+    """Return gains and time constants [s] of the creep of a model, shape (2, c)."""
     found = [e.parameters for e in model.effects if e.name == Creep.name]
     return np.array([found[0]['gain'], found[0]['time_constant']]) if found else np.empty((2, 0))
 
@@ -229,7 +231,7 @@ def _creeps(model: StageModel) -> bool:
 
 
 def _branches(h: Hysteresis, u: float) -> NDArray[np.float64]:
-    """Return H at a voltage that came up from the lowest one, and down from the highest."""
+    """Return H at u after a rise from the lowest voltage, and after a fall from the highest."""
     low, high = h.span
     return np.array([h(np.array([*way, u]))[-1] for way in ([low], [low, high])])
 
@@ -243,7 +245,7 @@ def _fit(
     creep: bool = False,
     zero: bool = False,
 ) -> tuple[Start, NDArray[np.float64]]:
-    """Return a start by least squares on the early part, and what it leaves of some samples."""
+    """Fit a start to the early part by least squares; return it with the error of some samples."""
     h = model.hysteresis
     part = piece.cut(0, early_part(model, piece, memory=memory))
     # the plays follow the voltage behind the effects of the input slot
@@ -279,11 +281,11 @@ def _fit(
     rates = h.relaxations[:, 0] if k and h.relaxations is not None else np.empty(0)
     age = np.arange(part.n)[keep] / part.sample_rate
     others = [passed(np.exp(-a * path)) for a in rates]
-    # creep goes on as it was, and so has passed G
+    # creep changes slowly, so it passes G with the static gain
     pairs = zip(gains, times, strict=True)
     others += [model.dynamics.gain * gain * np.exp(-age / tau) for gain, tau in pairs]
     others += [np.ones(age.size)] * z
-    # from one threshold to the next a play output falls by a share of the difference
+    # the output of a play falls, from one threshold to the next, by a share of their difference
     falls = np.diff(h.thresholds, prepend=0.0)[:m]
     whole = np.eye(rest.size)
     whole[:m, :m] = -np.tril(np.ones((m, m))) * falls
@@ -297,8 +299,8 @@ def _fit(
     weak = np.repeat(np.sqrt([LAG_PULL, CREEP_PULL, 0.0]), [k, c, z])
     origin = np.append(np.full(m, u0), np.zeros(k + c + z))
     found: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
-    # a play that was caught at once tells nothing of where else it may have stood: both of its
-    # ends are tried, those of a voltage that came up and of one that came down
+    # A play that moves at once gives no derivative by its start.  The search therefore begins
+    # twice: with plays after a rise of the voltage, and with plays after a fall.
     down = np.minimum(u0, max(u0, h.span[1]) - h.thresholds)
     for plays in (rest[:m], down) if m else (rest[:m],):
         falls_of = np.diff(-plays, prepend=-u0) / falls
@@ -318,7 +320,7 @@ def _fit(
             A = np.vstack([np.array([*columns, *others]).T, np.diag(pull)]) @ whole
             target = np.concatenate([e, pull * (rest - state)])
             step = lsq_linear(A, target, (low - number - margin, high - number + margin)).x
-            # a play may be caught sooner or later than before: then the full step goes too far
+            # a play may begin to move sooner or later than before; the full step then goes too far
             for share in (1.0, 0.5, 0.25, 0.125):
                 trial = np.clip(number + share * step, low, high)
                 new = error(origin + whole @ trial)

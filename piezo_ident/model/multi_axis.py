@@ -6,7 +6,7 @@ A stage of several axes: a chain for each axis, and paths between them.
 
     y_i = chain_i(v_i) + sum over j of path_ij(m_j),        m_j = chain_j(v_j)
 
-The motion m_j is that of axis j by its own voltage, so a path carries the hysteresis, the modes
+m_j is the motion of axis j by its own voltage.  A path therefore carries the hysteresis, the modes
 and the creep of its source.  A path is the effect `cross_coupling` in the model of axis i; its
 channel is the motion.  An axis has the name of its displacement in a record:
 
@@ -42,14 +42,14 @@ from piezo_ident.record.record import Piece, Record
 
 T = TypeVar('T')
 
-#: of a model file with several axes
+#: version of a model file with several axes
 SCHEMA_VERSION = 2
 MOTION = 'motion'
 
 
 def voltage_of(axis: str) -> str:
     """
-    Return the column of an axis's voltage.
+    Name the column of the voltage of an axis.
 
     >>> voltage_of('y'), voltage_of('y_b')
     ('v', 'v_b')
@@ -58,13 +58,13 @@ def voltage_of(axis: str) -> str:
 
 
 def motion_of(axis: str) -> str:
-    """Return the channel with the motion of an axis by its own voltage."""
+    """Name the channel with the motion of an axis by its own voltage."""
     return f'{MOTION}{axis[1:]}'
 
 
 def axes_of(records: Sequence[Record]) -> tuple[str, ...]:
     """
-    Return the axes whose voltage and displacement records hold, the first one before the others.
+    List the axes whose voltage and displacement the records hold; the first axis is ``y``.
 
     Raises
     ------
@@ -89,15 +89,16 @@ def axis_record(
     record: Record, axis: str, motions: Mapping[str, Sequence[Array]] | None = None
 ) -> Record:
     """
-    Return a record as one axis sees it.
+    Reduce a record to one axis.
 
     Parameters
     ----------
     record : Record
     axis : str
-        Its voltage and displacement become v and y.  A segment in which it rests loses its label.
+        The voltage and displacement of this axis become v and y.  A segment in which the axis
+        rests loses its label.
     motions : mapping of str to sequence of ndarray, optional
-        Of the other axes, an array a piece [m].  They become channels.
+        Motions by axis, an array for each piece [m].  Those of the other axes become channels.
     """
     span = max(float(np.ptp(_columns(p)[voltage_of(axis)])) for p in record)
 
@@ -138,7 +139,7 @@ def _columns(piece: Piece) -> dict[str, Array]:
 @dataclass(frozen=True, eq=False, repr=False)
 class EachAxis(Mapping[str, T], Generic[T]):
     """
-    What a verb gives for each axis of a stage, by the name of its displacement.
+    Results of a verb for each axis of a stage, by the name of its displacement.
 
     Examples
     --------
@@ -151,7 +152,7 @@ class EachAxis(Mapping[str, T], Generic[T]):
     axes: Mapping[str, T]
 
     def __getitem__(self, axis: str) -> T:
-        """Return what belongs to an axis."""
+        """Return the result of an axis."""
         return self.axes[axis]
 
     def __iter__(self) -> Iterator[str]:
@@ -163,32 +164,32 @@ class EachAxis(Mapping[str, T], Generic[T]):
         return len(self.axes)
 
     def __repr__(self) -> str:
-        """Return what is told of each axis, under its name."""
+        """Describe the result of each axis, under the name of the axis."""
         return self.told(repr)
 
     def mapped(self, change: Callable[[str, T], T]) -> EachAxis[T]:
-        """Return what a function makes of each axis's name and what belongs to it."""
+        """Apply a function to the name and the result of each axis."""
         return EachAxis({axis: change(axis, x) for axis, x in self.items()})
 
     def told(self, text: Callable[[T], str]) -> str:
-        """Return a text of each axis, under its name."""
+        """Join a text for each axis, under the name of the axis."""
         return '\n\n'.join(f'-- axis {axis}\n{text(x)}' for axis, x in self.items())
 
     @property
     def model(self) -> MultiAxisModel:
-        """The model of the stage, of results that hold one for each axis."""
+        """Model of the stage, from results that hold a model for each axis."""
         return MultiAxisModel({axis: x.model for axis, x in self.items()})  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False)
 class MultiAxisModel:
     """
-    A stage of several axes: a model for each, with the paths between them among its effects.
+    Model of a stage of several axes: a model for each axis, with the paths among its effects.
 
     Parameters
     ----------
     axes : mapping of str to StageModel
-        By the name of the displacement: ``y``, ``y_b``.
+        Models by the name of the displacement: ``y``, ``y_b``.
 
     Raises
     ------
@@ -197,7 +198,7 @@ class MultiAxisModel:
 
     Examples
     --------
-    Two axes of a scanner; the second moves by 1 % of what the first does:
+    Two axes of a scanner; the second also moves by 1 % of the motion of the first:
 
     >>> import numpy as np
     >>> import piezo_ident as pi
@@ -265,7 +266,7 @@ class MultiAxisModel:
             )
 
     def motions(self, record: Record) -> dict[str, list[Array]]:
-        """Return the motion of each axis by its own voltage, an array a piece [m]."""
+        """Return the motion of each axis by its own voltage, an array for each piece [m]."""
         found = {}
         for axis in self.axes:
             seen, own = axis_record(record, axis), self.own(axis)
@@ -274,7 +275,7 @@ class MultiAxisModel:
         return found
 
     def seen(self, record: Record) -> dict[str, Record]:
-        """Return a record as each axis sees it, with the motions of the others as channels."""
+        """Split a record by axis, with the motions of the other axes as channels."""
         columns = {c for piece in record for c in _columns(piece)}
         self.check_axes(
             [f'y{c[1:]}' for c in columns if c == 'v' or role_of(c) == 'v'], record.name
@@ -286,12 +287,12 @@ class MultiAxisModel:
         self, voltages: Mapping[str, ArrayLike], *, channels: Mapping[str, ArrayLike] | None = None
     ) -> dict[str, Array]:
         """
-        Return the displacement of each axis that voltages cause, in free run.
+        Predict the displacement of each axis from the voltages, in free run.
 
         Parameters
         ----------
         voltages : mapping of str to array_like, shape (n,)
-            By their columns, ``v`` and ``v_b`` [V].
+            Voltages by their columns, ``v`` and ``v_b`` [V].
         channels : mapping of str to array_like, shape (n,), optional
             Further signals that effects depend on.
 
@@ -317,7 +318,7 @@ class MultiAxisModel:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model file, in one piece: an old file stays whole until the new one is."""
+        """Write the model file; an old file stays whole until the new file is complete."""
         write_text(path, multi_axis_yaml(self))
 
 
@@ -328,7 +329,7 @@ def multi_axis_yaml(model: MultiAxisModel) -> str:
 
 
 def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
-    """Build a model of several axes from the contents of its file; ModelError when it is none."""
+    """Build a model of several axes from the contents of its file; raise ModelError on a fault."""
     check_version(data, name, SCHEMA_VERSION)
     axes = data['axes']
     if not (
@@ -355,7 +356,7 @@ def load(path: str | os.PathLike[str]) -> StageModel | MultiAxisModel:
     ConfigError
         When the file cannot be read or is not YAML.
     ModelError
-        When it is not a model, or one of a later schema.
+        When the file does not hold a model, or has a later schema.
 
     Examples
     --------

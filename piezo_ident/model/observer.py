@@ -2,33 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-An observer of the state: what the sensor says of that which the voltage alone does not tell.
+Observe the state of a stage that its voltage leaves unknown, by its measured displacement.
 
-The free run of a model begins at rest.  A real stage still creeps from earlier motion, its sensor
-may have been set to another zero, and its plays stand where nobody saw them move.  In normalised
-units the displacement is that of the free run, plus
+The free run of a model begins at rest.  A real stage may still creep from earlier motion, its
+sensor may have another zero, and the outputs of its plays may be unknown.  In normalised units
+the displacement is the free run plus
 
-    o  +  g sum_i c_i d_i  +  m,        d_i(k+1) = exp(-1 / (f_s tau_i)) d_i(k),
+    o  +  g sum_i c_i d_i  +  m,        d_i(k+1) = exp(-1 / (f_s tau_i)) d_i(k).
 
-where o is an offset that walks at random, d_i is how far an element of creep is from where the
-free run has it, c_i is its share and g = G(1).  m is the error of the model, correlated along the
-path of the voltage: at rest it stays as it is, and no time averages it out.  A Kalman filter
-follows o, d and m by the means of groups of samples.  `estimate` is the free run plus offset and
-creep; m is no part of it, since what the model lacks must show.
+- o is an offset, a random walk.
+- d_i is the distance of creep element i from its value in the free run, c_i its share, g = G(1).
+- m is the error of the model.  It is correlated along the path of the voltage, so at rest it
+  stays the same and no averaging over time removes it.
 
-On request the gain is followed, too: g x more, of the free run x about the zero of the
-model, where g walks at random.  Only motion tells a gain from an offset.  What time adds to its
-variance waits until the voltage moves, and is freed along the path; at rest g stays as it is.  A
-step of the gain is refused first, as any step is.  It is followed as soon as the voltage has moved
-and what was refused goes with x.
+A Kalman filter follows o, d and m by the means of groups of samples.  `estimate` is the free run
+plus offset and creep, without m: the error of the model must stay visible.
 
-Two hypotheses run side by side, weighed by their likelihood: the zero is where it was, and it is
-anywhere.  Slow creep and a zero look alike at first, and a wide prior of the zero alone would take
-all that creep leaves.
+The gain is followed on request.  It adds gamma x, with the free run x about the zero of the model
+and a random walk gamma.  Only motion distinguishes a gain from an offset.  The variance that
+time adds to gamma therefore counts along the path only; at rest gamma stays the same.  The filter
+refuses a step of the gain at first, as it refuses every step.  It accepts the step once the
+voltage has moved and the refused measurements are proportional to x.
 
-Unknown outputs of plays are bounds, between which they start and which the voltage draws together;
-`MemoryBounds` has them.  What they add is part of the offset, which may change by as much as their
-band shrinks.
+Two hypotheses run side by side, weighted by their likelihood: the zero is unchanged, or it is
+anywhere.  Slow creep and a shifted zero look alike at first.  A wide prior of the zero alone would
+take all creep for a shift.
+
+The unknown output of a play lies between bounds, which the voltage draws together; see
+`MemoryBounds`.  The contribution of these plays is part of the offset.  It may change by as much
+as their band shrinks.
 
 Kalman filter: R. E. Kalman, "A new approach to linear filtering and prediction problems", J. Basic
 Engineering 82(1), 1960, doi:10.1115/1.3662552.  Weights of hypotheses: D. T. Magill, "Optimal
@@ -52,33 +54,33 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.record.record import Piece
 
-#: displacement comes so many samples later than the estimate that uses it: a block
+#: age of the displacement that corrects an estimate [samples]: a block
 HORIZON = 100
 #: time over which displacement is averaged to one measurement [s]
 GROUP = 1e-3
-#: rms error of a model that holds none, and the smallest that is believed of one, in spans: that
-#: of the paper's model, and a tenth of a bit of its converters
+#: rms error that is assumed for a model without a known error, and smallest assumed error, in
+#: spans: the error of the paper's model, and a tenth of a bit of its converters
 UNKNOWN, LEAST = 1e-2, 1e-6
 #: path of the voltage over which the error of a model changes, as a share of its range (taste:
 #: the misfit of H has a few waves over a stroke)
 PATH = 0.25
-#: rms change of the offset in a second, in spans: 100 nm in a minute of a span of 100 um, the
-#: faster thermal drifts
+#: rms change of the offset in a second, in spans: 100 nm in a minute for a span of 100 um, a fast
+#: thermal drift
 WALK = 1e-3 / np.sqrt(60.0)
-#: rms size of the offset, in spans: a zero that was left alone, and one that is anywhere (taste)
+#: rms size of the offset, in spans, for an unchanged zero and for a zero anywhere (taste)
 ZEROS = (1e-3, 1.0)
-#: rms change of the gain in a second: d33 of PZT changes by some 0.1 % a kelvin, and a stage that
-#: warms as it works by a kelvin in a minute
+#: rms change of the gain in a second: d33 of PZT changes by some 0.1 % per kelvin, and a working
+#: stage warms by a kelvin in a minute
 GAIN_WALK = 1e-3 / np.sqrt(60.0)
-#: rms size of its change since identification (taste: some ten kelvin and lost poling)
+#: rms change of the gain since identification (taste: some ten kelvin and lost poling)
 GAIN_SIZE = 0.1
 #: measurements in a row that make a step, and their spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
-#: rms size of d, as a share of the range of H: earlier motion was anywhere in it, equally likely
+#: rms size of d, as a share of the range of H: uniform, as earlier motion was anywhere in it
 BEYOND = 1.0 / np.sqrt(12.0)
-#: deviation beyond which a measurement is no information, in standard deviations (taste)
+#: deviation beyond which a measurement is refused at first, in standard deviations (taste)
 GATE = 5.0
-#: time for which what is beyond it must last until it is believed [s]
+#: time of refused measurements after which they are believed [s]
 PATIENCE = 5.0
 #: share of the range that counts as its lower end, where the memory is known
 REST = 0.01
@@ -87,21 +89,21 @@ REST = 0.01
 @dataclass(frozen=True, eq=False)
 class Observed:
     """
-    What an observer says of some samples, shapes (n,), in metres.
+    State of an observer along samples, shapes (n,), in metres.
 
     Attributes
     ----------
     estimate, std : ndarray
         Displacement, and the standard deviation of its error.
     offset, offset_std : ndarray
-        Part of the estimate that the free run lacks and that stays, plays that have not moved
-        since the start included, and its standard deviation.
+        Constant part of the correction, with the plays that have not moved since the start, and
+        its standard deviation.
     creep, creep_std : ndarray
-        The same of creep from earlier motion.
+        Creep from earlier motion, and its standard deviation.
     gain, gain_std : ndarray
-        Relative change of the gain, and its standard deviation; zero where it is not observed.
+        Relative change of the gain, and its standard deviation; zero if it is not followed.
     band : ndarray
-        What plays of unknown output may still change of the offset as the voltage moves on.
+        Largest further change of the offset by plays of unknown output.
     """
 
     estimate: Array
@@ -117,9 +119,9 @@ class Observed:
 
 class Observer:
     """
-    Follows what the free run of a model lacks, by displacement that comes a horizon later.
+    Follows offset, creep and gain that a free run lacks, by displacement of a horizon before.
 
-    The result does not depend on how a stream is cut.
+    The result does not depend on the size of the blocks.
 
     Parameters
     ----------
@@ -127,14 +129,15 @@ class Observer:
     horizon : int, optional
         Samples by which displacement is older than the estimate that uses it.
     error, noise : float, optional
-        Rms error of the model, and of the sensor [m]; by default the error that the model holds,
-        of which noise is a part.
+        Rms error of the model, and of the sensor [m].  Default: the error stored with the model,
+        which contains the noise.
     zeros : tuple of float, optional
         Size of the offset [m, rms] by each hypothesis.
     gate : float, optional
-        Standard deviations beyond which a measurement is first not believed.
+        Deviation beyond which a measurement is refused at first [standard deviations].
     known : bool, optional
-        Whether the free run has the memory of the plays; else it does at the lowest voltage alone.
+        Whether the free run begins with known outputs of the plays.  A start at the lowest voltage
+        always does.
     gain : bool, optional
         Whether the gain is followed, too.
     """
@@ -179,11 +182,11 @@ class Observer:
         h = model.hysteresis
         reach = BEYOND * float(np.ptp(h(np.linspace(*h.span, 65))))
         walk = WALK**2 * size / rate
-        # in the order of their places
+        # in the order of the places in the kernel
         numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, reach**2]
         numbers += [GAIN_WALK**2 * size / rate, GAIN_SIZE**2]
         own = int(self._gain)
-        # that of the gain is another at each group
+        # the entry of the gain is set for each group
         row = np.concatenate([[1.0], gains * before.mean(axis=1), np.zeros(own), [1.0]])
         law = kernel.Law(
             lead=gains * left**self.horizon,
@@ -218,21 +221,21 @@ class Observer:
 
     @property
     def known(self) -> bool:
-        """Whether the voltage so far tells the outputs of all plays."""
+        """Whether the voltage so far determines the outputs of all plays."""
         return self._started and not self._is_lost and bool(self._bounds.known.all())
 
     def lose_memory(self) -> None:
-        """Take note that voltage was lost before the next sample."""
+        """Note that voltage was lost before the next sample."""
         self._is_lost = True
 
     def accept(self) -> float:
         """
-        Take the step of the sensor that is not believed yet as one of its zero; return it [m].
+        Accept the refused measurements as a step of the zero of the sensor; return its size [m].
 
         Raises
         ------
         DataError
-            When there is none, or what the sensor says is no step.
+            When too few measurements are refused, or they differ too much for a step.
         """
         now = self._state.now if self._started else np.zeros(kernel.PLACES)
         n, total, squares = now[kernel.SEEN], now[kernel.SUM_E], now[kernel.SUM_EE]
@@ -251,9 +254,9 @@ class Observer:
 
     def ahead(self, lead: int, n: int) -> tuple[Array, float]:
         """
-        Return what offset and creep [m] will be, shape (n,), and the relative change of the gain.
+        Extrapolate offset plus creep [m], shape (n,), and return the relative change of the gain.
 
-        The first of the samples comes `lead` samples behind the last one that was processed.
+        The first of the n samples comes `lead` samples after the last processed sample.
         """
         if not self._started:
             return np.zeros(n), 0.0
@@ -265,16 +268,16 @@ class Observer:
 
     def process(self, v: Array, free: Array, measured: Array) -> Observed:
         """
-        Return the estimate of the next samples; all shapes (n,).
+        Estimate the displacement of the next samples; all shapes (n,).
 
         Parameters
         ----------
         v : ndarray
             Voltage [V].
         free : ndarray
-            Free run of the model under it [m].
+            Free run of the model under this voltage [m].
         measured : ndarray
-            Displacement of `horizon` samples before each [m], NaN where there is none.
+            Displacement `horizon` samples before each sample [m]; NaN if it is missing.
         """
         scaling, g = self.model.scaling, abs(self.model.dynamics.gain)
         u = scaling.u(v)
@@ -291,7 +294,7 @@ class Observer:
         self._last = float(u[-1])
         new = np.stack([scaling.x(free), path, band])
         if self._past is None:
-            # there is nothing to see before the start
+            # no displacement before the start
             self._past = np.full((3, self.horizon), np.nan)
             self._state.now[kernel.BAND] = band[0]
         whole = np.concatenate([self._past, new], axis=1)
@@ -314,14 +317,14 @@ class Observer:
 
 def observe(model: StageModel, piece: Piece, horizon: int = HORIZON, **options: Any) -> Observed:
     """
-    Return what an observer says along a record, whose readings that are no numbers are missing.
+    Run an observer along a piece of a record; NaN and infinite readings count as missing.
 
     Parameters
     ----------
     model : StageModel
     piece : Piece
     horizon : int, optional
-        As of `Observer`, and its other parameters.
+        As for `Observer`; `options` are its other parameters.
 
     Examples
     --------

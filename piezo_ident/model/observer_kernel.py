@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The compiled loops of `piezo_ident.model.observer`: a Kalman filter a hypothesis, in groups."""
+"""Compiled loops of `piezo_ident.model.observer`: a Kalman filter for each hypothesis."""
 
 from __future__ import annotations
 
@@ -11,56 +11,59 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import ordered_kernel
 
-#: motion of the free run under which a reading that does not change at all is stuck, in spans
+#: motion of the free run after which a constant reading counts as stuck, in spans
 STUCK = 0.05
-#: log of the least weight of a hypothesis, from which it can still come back
+#: logarithm of the smallest weight of a hypothesis, from which it can still recover
 FAINT = -30.0
-#: variance of the offset, over the mean square of what was refused, once that is believed: nine
-#: tenths of it count as offset, the rest as error of the model (taste)
+#: variance added to the offset when refused measurements are believed, over their mean square:
+#: nine tenths of them count as offset, the rest as error of the model (taste)
 JUMP = 9.0
-#: share of what an offset leaves of refused measurements that a gain may leave, to be it (taste)
+#: largest remaining error of refused measurements with a gain, as a share of that with an offset,
+#: for which they count as a gain (taste)
 EXPLAINED = 0.1
-#: size of a change of the gain that is no fault of the sensor, in rms sizes (taste)
+#: largest believable change of the gain, in rms sizes; a larger one is a fault of the sensor
+#: (taste)
 LIKELY = 3.0
-#: path over which it is seen on what strokes a gain stands, in lengths of the error (taste)
+#: path over which the strokes are averaged on which the gain is seen, in correlation lengths of
+#: the error (taste)
 STROKES = 10.0
 
-# places of the numbers that `State.now` holds
+# places in `State.now`
 COUNT, PATH, BAND, MOVED, SPREAD, SCALE, REFUSED, SCORES, READING, BEGAN = range(10)
 OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
-# and with a gain: mean free run of the group, variance of the gain that motion has not freed yet,
-# and mean and variance of the free run over the last few strokes
+# for the gain: FREE, mean free run of the group; IDLE, variance of the gain that waits for motion;
+# MEAN_X and VAR_X, mean and variance of the free run over the last few strokes
 FREE, IDLE, GAIN, GAIN_VAR, CROSS, MEAN_X, VAR_X = range(16, 23)
-# sums over measurements that were refused, of their innovations e and of the free run x
+# sums over refused measurements, of their innovations e and of the free run x
 SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE, PLACES = range(23, 30)
-# places of the numbers that `Law.numbers` holds
+# places in `Law.numbers`
 NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE = range(10)
 
 
 class Law(NamedTuple):
-    """What a filter knows from the start: rows of the states, and numbers."""
+    """Constants of a filter: factors of its states, and numbers."""
 
-    lead: Array  # of creep in the displacement a horizon later
-    left: Array  # share of each element of creep after a sample
-    kept: Array  # the same of offset, creep, gain after a group
+    lead: Array  # Weight of each creep element in the displacement a horizon later.
+    left: Array  # Decay of each creep element in a sample.
+    kept: Array  # Decay of offset, creep and gain in a group.
     numbers: Array
 
 
 class State(NamedTuple):
-    """What a filter has found so far: the states of b hypotheses, and the group under way."""
+    """Variables of a filter: the states of b hypotheses, and the present group of samples."""
 
     x: Array  # (b, n)
     P: Array  # (b, n, n)
-    weight: Array  # (b,), logarithms
-    row: Array  # (n,), of offset, creep, gain and m in the mean of a group
-    group: Array  # (2, size), residual of the group and free run; NaN where there is none
-    coming: Array  # creep in the displacement a horizon later, by element
+    weight: Array  # (b,), logarithms.
+    row: Array  # (n,), weights of offset, creep, gain and m in the mean of a group.
+    group: Array  # (2, size), residual and free run of the group; NaN if missing.
+    coming: Array  # Creep in the displacement a horizon later, by element.
     now: Array
 
 
 @ordered_kernel
 def _typical(group: Array, noise: float) -> tuple[float, float, int]:
-    # mean of the numbers that are not far from the median, of the free run there, and their count
+    # mean of the residuals near their median, mean of the free run at these, and their count
     finite = np.isfinite(group[0])
     x = np.sort(group[0][finite])
     n = x.size
@@ -68,7 +71,7 @@ def _typical(group: Array, noise: float) -> tuple[float, float, int]:
     if n >= 3:
         middle = 0.5 * (x[(n - 1) // 2] + x[n // 2])
         off = np.sort(np.abs(x - middle))
-        # six standard deviations: 6 / 0.6745 medians of the size
+        # six standard deviations are 6 / 0.6745 times the median deviation
         limit = 8.9 * off[n // 2] + 6.0 * noise
     total, free, count = 0.0, 0.0, 0
     for k in range(finite.size):
@@ -81,7 +84,7 @@ def _typical(group: Array, noise: float) -> tuple[float, float, int]:
 
 @ordered_kernel
 def _has_gain(law: Law, s: State) -> bool:
-    # offset and m stand beside creep; a gain stands before m
+    # the states are offset, creep, the gain if it is followed, and m
     return s.row.size > law.lead.size + 2
 
 
@@ -96,11 +99,11 @@ def _let_time_pass(law: Law, s: State) -> None:
             s.x[b, i] *= one
             for j in range(n):
                 s.P[b, i, j] *= one * (law.kept[j] if j < n - 1 else phi)
-        # what unknown plays add has changed by anything up to the shrinking, equally likely
+        # unknown plays have moved the offset by up to the shrinking of their band, equally likely
         s.P[b, 0, 0] += numbers[WALK] + (now[MOVED] ** 2 - now[SPREAD] ** 2) / 3.0
         s.P[b, n - 1, n - 1] += now[SCALE] * numbers[ERROR] * (1.0 - phi * phi)
     if _has_gain(law, s):
-        # time makes the gain less sure, but a reading tells of that only along a path
+        # time makes the gain less certain, and this variance counts along the path only
         share = 1.0 - phi ** (1.0 / STROKES)
         d = now[FREE] - now[MEAN_X]
         now[MEAN_X] += share * d
@@ -125,7 +128,7 @@ def _innovation(law: Law, s: State, b: int, mean: float, noise: float) -> tuple[
 
 @ordered_kernel
 def _rescale(law: Law, s: State, scale: float) -> None:
-    # take another size of the errors; m is at once as large as that, or the size would run away
+    # changes the scale of the errors; m grows at once with it, or the scale would run away
     scale = max(1.0, scale)
     more = max(0.0, scale - s.now[SCALE]) * law.numbers[ERROR]
     for b in range(s.weight.size):
@@ -135,7 +138,7 @@ def _rescale(law: Law, s: State, scale: float) -> None:
 
 @ordered_kernel
 def forget_refused(now: Array) -> None:
-    """Forget what was refused so far."""
+    """Forget the refused measurements."""
     now[REFUSED] = now[SCORES] = 0.0
     now[SEEN:PLACES] = 0.0
 
@@ -153,10 +156,10 @@ def _note_refused(now: Array, e: float) -> None:
 
 @ordered_kernel
 def _is_gain(law: Law, now: Array) -> bool:
-    # whether what was refused goes with the displacement, and is no step of the zero
+    # whether the refused measurements are proportional to the displacement, unlike a step
     size, n = law.numbers[GAIN_SIZE], now[SEEN]
     swept = now[SUM_XX] - now[SUM_X] ** 2 / n
-    # the error of a model goes with a shorter path as well
+    # on a shorter path the error of the model looks proportional, too
     if 12.0 * swept < n * law.numbers[LENGTH] ** 2:
         return False
     by_gain = now[SUM_EE] - now[SUM_XE] ** 2 / now[SUM_XX]
@@ -167,7 +170,7 @@ def _is_gain(law: Law, now: Array) -> bool:
 
 @ordered_kernel
 def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
-    # judge a measurement by the hypothesis that it suits best; what lasts is believed in the end
+    # the hypothesis that fits best judges a measurement; lasting refusals are believed in the end
     numbers, now = law.numbers, s.now
     noise = now[SCALE] * numbers[NOISE] / count
     score, power, e = np.inf, 0.0, 0.0
@@ -179,7 +182,7 @@ def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
         now[REFUSED] = max(0.0, now[REFUSED] - 1.0)
         if now[REFUSED] == 0.0:
             forget_refused(now)
-        # a model that errs by more than it says is believed less
+        # a model that errs by more than expected gets a larger error
         _rescale(law, s, now[SCALE] * (1.0 + numbers[GROWTH] * (score - 1.0)))
         return True
     now[REFUSED] += 1.0
@@ -197,7 +200,7 @@ def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
     forget_refused(now)
     for b in range(s.weight.size):
         s.P[b, 0, 0] += JUMP * score * power
-        # what was found of creep may stand on an error of the model
+        # the creep found so far may have come from an error of the model
         for i in range(1, 1 + law.lead.size):
             s.P[b, i, i] += numbers[REACH]
     return True
@@ -219,7 +222,7 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
             for j in range(n):
                 s.P[b, i, j] -= shared[i] * shared[j] / power
         s.weight[b] -= 0.5 * (np.log(power) + min(off * off / power, numbers[GATE]))
-    # mean square of m of late
+    # running mean square of m
     m = s.x[int(np.argmax(s.weight)), -1]
     now[MISFIT] += numbers[GROWTH] * (m * m - now[MISFIT])
     s.weight[:] = np.maximum(s.weight - s.weight.max(), FAINT)
@@ -227,7 +230,7 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
 
 @ordered_kernel
 def tell(law: Law, s: State) -> None:
-    """Note mean and variance, over the hypotheses, of what is corrected."""
+    """Average the corrections over the hypotheses, with their variances, and note them."""
     now = s.now
     share = np.exp(s.weight)
     share /= share.sum()
@@ -265,8 +268,8 @@ def tell(law: Law, s: State) -> None:
 
 @ordered_kernel
 def _gain_std(law: Law, s: State) -> float:
-    # a motion that repeats repeats the error of the model, whose slope no time averages out: each
-    # of the two branches has a value a twice its length
+    # A repeated motion repeats the error of the model, so time does not average out its slope.
+    # Each of the two branches of a loop holds one independent error for two correlation lengths.
     if not _has_gain(law, s):
         return 0.0
     now, size = s.now, law.numbers[GAIN_SIZE]
@@ -294,17 +297,17 @@ def _end_group(law: Law, s: State) -> None:
 @ordered_kernel
 def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array) -> None:
     """
-    Take y, and free run, path and band, of a horizon before; write what is corrected.
+    Take y with free run, path and band of a horizon before; write the corrections to `out`.
 
-    Rows of out, of shape (8, n): the whole correction of the free run of now, offset, creep and
-    gain, with the standard deviation behind each.
+    The rows of `out`, shape (8, n), are the whole correction of the present free run, offset,
+    creep and gain.  The standard deviation of each follows it.
     """
     now, size = s.now, s.group.shape[1]
     gain_std = _gain_std(law, s)
     for k in range(y.size):
         then, x = before[0, k], free[k]
         creep = 0.0
-        if not np.isnan(then):  # else before the start
+        if not np.isnan(then):  # NaN comes before the start
             if y[k] != now[READING] and np.isfinite(y[k]):
                 now[READING], now[BEGAN] = y[k], then
             stuck = abs(then - now[BEGAN]) > STUCK

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model of one axis or of several as a C header."""
+"""Export a model of one axis or of several as a C header."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from piezo_ident.model.stage_model import StageModel
 
 def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options: Any) -> str:
     """
-    Return a model as a C header: prediction and feed-forward, sample by sample.
+    Write a model as a C header that predicts and feeds forward sample by sample.
 
     Parameters
     ----------
     model : StageModel or MultiAxisModel
     name : str, optional
-        With which all names in the header begin.
+        Beginning of all names in the header.
     **options
         ``limits``, ``slew``, ``preview``, ``title`` and ``feedforward`` of
         `piezo_ident.export.header.export_c`.
@@ -30,18 +30,18 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     Returns
     -------
     str
-        C99 without dependencies; a comment at its head says how to call it, and what the
-        feed-forward does not make up for.  Of several axes the header of each comes first; the
-        step of the stage takes all voltages.
+        C99 without dependencies.  A comment at its head explains the calls, and names the effects
+        that the feed-forward leaves uncorrected.  A model of several axes has a header for each
+        axis, then a step of the stage that takes all voltages.
 
     Raises
     ------
     DataError
-        When it is given no model, or limits or slew are impossible.
+        When `model` is something else, or limits or slew are impossible.
     ConfigError
-        When the name is none in C.
+        When the name is not allowed in C.
     ModelError
-        When an effect of the model is not written in C, or the preview is shorter than its delay.
+        When an effect of the model has no C code, or the preview is shorter than the delay.
 
     Examples
     --------
@@ -64,13 +64,13 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
 
 
 def channels_of(model: StageModel) -> list[str]:
-    """Return the further channels of a model in the order of its C."""
+    """Return the further channels of a model in the order of its C code."""
     links = [link for part in links_of(model) for link in part.links]
     return LinkGroup(links).channels
 
 
 def _stage(model: MultiAxisModel, name: str, tags: dict[str, str], sources: list[str]) -> str:
-    """Return the stage of all axes in C, behind the headers of each."""
+    """Write the C code of the whole stage, which follows the headers of its axes."""
     order, n = list(model.axes), len(model.axes)
     members = [f'    {tags[a]}_own_state own_{a};' for a in sources]
     members += [f'    {tags[a]}_state {a};' for a in order]

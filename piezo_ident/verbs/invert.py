@@ -24,24 +24,24 @@ from piezo_ident.model.multi_axis import (
 )
 from piezo_ident.model.stage_model import StageModel
 
-#: rounds of an inversion of several axes, at most, and the change of a voltage [of the span of
-#: the model] from one to the next that ends them
+#: most rounds of an inversion of several axes, and the change of a voltage between two rounds that
+#: ends them [of the span of the model]
 ROUNDS, SAME = 6, 1e-5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiAxisInverse(EachAxis[Inverse]):
     """
-    The voltages under which a stage of several axes moves as wanted.
+    Voltages that move a stage of several axes along wanted displacements.
 
     Attributes
     ----------
     axes : mapping of str to Inverse
-        Of each axis, with the motions of the others known.
+        Inverse of each axis, with the motions of the other axes known.
     voltages : dict of str to ndarray, shape (n,)
-        By their columns, ``v`` and ``v_b``, from one common beginning [V].
+        Voltages by their columns, ``v`` and ``v_b``, from one common beginning [V].
     predicted : dict of str to ndarray, shape (n,)
-        Displacement of the whole model under them, by axis [m].
+        Displacement of the whole model under these voltages, by axis [m].
     lead : int
         Samples by which the voltages begin before the wanted motion.
     errors : dict of str to float
@@ -64,7 +64,7 @@ class MultiAxisInverse(EachAxis[Inverse]):
     errors: Mapping[str, float]
 
     def __repr__(self) -> str:
-        """Return what is told of each axis, and what is left of all together."""
+        """Describe the inverse of each axis, and the errors of the whole stage."""
         left = ', '.join(f'{axis} {error:.2g}' for axis, error in self.errors.items())
         return f'{super().__repr__()}\n\nleft by the inversion of all [% of stroke]: {left}'
 
@@ -87,21 +87,22 @@ def invert(
     **options: Any,
 ) -> Inverse | MultiAxisInverse:
     """
-    Return the voltage under which a model moves as wanted, or the voltages of all its axes.
+    Find the voltage that moves a model along a wanted displacement, or the voltages of its axes.
 
     Parameters
     ----------
     model : StageModel or MultiAxisModel
     wanted : array_like, shape (n,), or mapping of str to array_like
-        Displacement [m], sampled at the rate of the model; of several axes each by its name, and
-        one that is absent rests at the displacement of its lowest voltage.  Before and after it
-        the stage rests, at its beginning as one that came there from its lowest voltage in one
-        stroke and has settled: with creep, better begin where nothing creeps.
+        Displacement [m], sampled at the rate of the model.  A model of several axes needs a
+        mapping by axis; an absent axis rests at the displacement of its lowest voltage.  The stage
+        is taken to rest before and after the motion.  The rest before it is the state after one
+        stroke from the lowest voltage, settled.  With creep, begin at the displacement of the
+        lowest voltage, which does not creep.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     **options
         ``limits``, ``slew``, ``clip``, ``sample_rate`` and ``like`` of
-        `piezo_ident.control.inverse.invert`; those of several axes hold for each.
+        `piezo_ident.control.inverse.invert`; they hold for each axis.
 
     Returns
     -------
@@ -110,14 +111,14 @@ def invert(
     Raises
     ------
     DataError
-        When the wanted motion is no vector of finite numbers, or the limits do not reach it.
+        When the wanted motion is not a vector of finite numbers, or lies beyond the limits.
     ModelError
         When the model has no inverse.
 
     Notes
     -----
-    The motion of the other axes is a known disturbance of each.  It is the wanted one at first,
-    and then that under the voltages of the round before.
+    The motions of the other axes are a known disturbance of each axis.  The first round takes
+    their wanted motions, each later round their motions under the voltages of the round before.
 
     Examples
     --------
@@ -157,7 +158,7 @@ def invert(
 
 
 def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Array]:
-    """Return the wanted motion of every axis, or refuse it."""
+    """Return the wanted motion of every axis; raise DataError if the motions do not fit."""
     if not isinstance(wanted, Mapping):
         raise DataError(
             f'invert: give the motion of each axis by its name, of {", ".join(model.axes)}'
@@ -176,7 +177,7 @@ def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -
 
 
 def _led(channels: Mapping[str, ArrayLike] | None, lead: int) -> dict[str, Array]:
-    """Return channels that begin so many samples earlier with their first values."""
+    """Begin channels `lead` samples earlier by repeating their first values."""
     return {k: np.pad(np.asarray(x), (lead, 0), mode='edge') for k, x in (channels or {}).items()}
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identify and diagnose a stage, axis by axis where it has several."""
+"""Identify and diagnose a stage of one axis, or of several axis by axis."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
 
-#: share of the range of a voltage below which it rests
+#: largest change of a voltage at rest, as a share of its range
 RESTS = 1e-3
-#: seconds of rest, while another axis moves, that are no part of an identification
+#: longest rest of an axis that its identification keeps while another axis moves [s]
 LONG = 1.0
-#: seconds that are judged at once
+#: length of the blocks in which rest is judged [s]
 BLOCK = 0.25
 
 
@@ -49,34 +49,34 @@ def identify(
     steps: Steps | None = None,
 ) -> Identification | EachAxis[Identification]:
     """
-    Learn a stage from its records, each axis where they hold several.
+    Identify a stage from its records, each of several axes by itself.
 
     Parameters
     ----------
     records : sequence of Record, or Record
-        With segments ``noise`` and ``triangle`` (and ``step``) the three steps are taken; segments
-        of other kinds are then left for validation.  Without them every run is fitted in one
-        go, but for what is held out.  With ``v_<name>`` and ``y_<name>`` beside ``v`` and ``y``
-        the stage has several axes.  They may move one after the other, in one record or in
-        several, or at once.
+        Records with segments ``noise`` and ``triangle`` (and ``step``) are identified in three
+        steps; their other segments serve for validation.  Records without these segments are
+        fitted as a whole, except for a part that is held out.  Columns ``v_<name>`` and
+        ``y_<name>`` beside ``v`` and ``y`` are further axes.  The axes may move at once or one
+        after the other, in one record or in several.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
-        Records that are neither fitted nor looked at; the headline is about them.
+        Unseen records, which take no part in the fit; the headline gives the error on them.
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
     steps : Steps, optional
-        Steps of the three that were taken already, of a stage of one axis; where they are given,
-        even empty ones, records without labelled segments are refused.
+        Results of earlier steps, for a stage of one axis.  If they are given, even empty, records
+        without labelled segments are refused.
 
     Returns
     -------
     Identification, or EachAxis of Identification
-        Of several axes without the paths between them, which `diagnose` finds.
+        The models of several axes lack the paths between them, which `diagnose` finds.
 
     Raises
     ------
     IdentificationError
-        When the data do not carry a model; the message says what they lack.
+        When the data are not enough for a model; the message names the missing data.
     DataError
         When records hold different axes.
 
@@ -141,16 +141,16 @@ def diagnose(
     progress: Progress = silent,
 ) -> Diagnosis | EachAxis[Diagnosis]:
     """
-    Find what a model lacks, add it, and say how sure that is.
+    Find the effects that a model lacks, add them, and say how certain they are.
 
     Parameters
     ----------
     model : StageModel or MultiAxisModel
         From `identify`; it may hold effects already.
     records : Record, or sequence of Record
-        Measured data that the model was not identified from, of its sampling rate.  Of more than
-        ``settings.most_samples`` the beginnings of the records are searched and fitted, and a
-        warning says how much that is.
+        Measured data at the sampling rate of the model that its identification did not use.  If
+        they exceed ``settings.most_samples``, the beginnings of the records are searched and
+        fitted, and a warning says how much this is.
     settings : DiagnosisSettings, optional
     progress : callable, optional
         Called with the name of the step and the share done; may raise `Cancelled`.
@@ -158,18 +158,18 @@ def diagnose(
     Returns
     -------
     Diagnosis, or EachAxis of Diagnosis
-        Of several axes each is judged with the motions of the others known: the channel of its
-        `cross_coupling` names the axis that it comes from.
+        Each of several axes is judged with the motions of the others known.  The channel of a
+        `cross_coupling` names the axis that the coupling comes from.
 
     Raises
     ------
     IdentificationError
-        When the records carry nothing to judge, the displacement does not follow the voltage, or
-        the joint fit is singular.
+        When the voltage never moves, the displacement does not follow it, too few samples are
+        left, or the joint fit is singular.
 
     Examples
     --------
-    A stage whose amplifier saturates, which its model does not know:
+    A stage whose amplifier saturates, and whose model lacks this saturation:
 
     >>> from dataclasses import replace
     >>> import numpy as np
@@ -205,7 +205,7 @@ def _named(progress: Progress, axis: str) -> Progress:
 
 
 def _moved(record: Record, axis: str) -> list[Record]:
-    """Return a record as an axis sees it, without long rests in which only others move."""
+    """Reduce a record to one axis, without its long rests while other axes move."""
     seen = axis_record(record, axis)
     pieces: list[Piece] = []
     moves = False
@@ -224,7 +224,7 @@ def _moved(record: Record, axis: str) -> list[Record]:
 
 
 def _rests(v: Array, span: float, size: int) -> Mask:
-    """Return for each block of a size whether a voltage rests in it, beside a span."""
+    """Return for each block of `size` samples whether v changes by at most `RESTS` of `span`."""
     starts = np.arange(0, v.size, size)
     spans = np.maximum.reduceat(v, starts) - np.minimum.reduceat(v, starts)
     return np.asarray(spans <= RESTS * span)

@@ -33,17 +33,17 @@ def free_run(
 
 def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | EachAxis[FreeRun]:
     """
-    Predict a record in free run, and compare it with what was measured.
+    Predict a record in free run, and compare it with the measured displacement.
 
-    A record that does not start at the lowest voltage starts from an unknown memory, which is
-    estimated from its early part.  So is creep of earlier motion, of a model with creep, where it
-    shows.  Nothing is fitted to the samples after that part.
+    A record that starts above the lowest voltage has an unknown memory, which is estimated from
+    its early part.  A model with creep also gets the creep from earlier motion if the early part
+    shows it.  Later samples are predicted without any fit.
 
     Parameters
     ----------
     model : StageModel or MultiAxisModel
     record : Record
-        Its displacement serves only the estimate and the errors.
+        Its displacement serves only for this estimate and for the errors.
 
     Returns
     -------
@@ -54,8 +54,8 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     ModelError
         When a piece has another sampling rate than the model, or the prediction overflows.
     DataError
-        When the record holds no displacement, which `simulate` of the model does not need; or
-        lacks an axis.
+        When the record lacks the displacement or an axis; `simulate` of a model takes voltages
+        alone.
 
     Examples
     --------
@@ -77,7 +77,7 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
 def predict(
     model: StageModel | MultiAxisModel, record: Record
 ) -> tuple[Array, ...] | EachAxis[tuple[Array, ...]]:
-    """Return the displacement that voltages cause, whatever was measured, an array a piece [m]."""
+    """Predict the displacement from the voltages alone; an array for each piece [m]."""
     if not isinstance(model, MultiAxisModel):
         return predict_axis(model, record)
     seen = model.seen(record)
@@ -85,7 +85,7 @@ def predict(
 
 
 def prediction_doubts(model: StageModel | MultiAxisModel, record: Record) -> tuple[str, ...]:
-    """Return what limits the trust in a prediction from voltages alone."""
+    """List reasons to doubt a prediction from voltages alone, as warnings."""
     if not isinstance(model, MultiAxisModel):
         return (*unknown_starts(model, record), *model.extrapolation(record))
     return tuple(
