@@ -4,11 +4,12 @@
 """
 Learn the gain of a running stage slowly, and on request its hysteresis.
 
-The learnt displacement is the free run plus the sum of theta_j f_j.  f_j is the response to one
-change of the model: of its gain, of the weights of its plays (hats over their thresholds), of its
-cubic, or of the shares of its creep.  A changed model runs for each f_j, so amplifier, creep, G
-and delay act on the change as they act on the stage.  A high-pass removes offset, drift and creep
-of earlier motion from the f_j and from the measured error; the observer corrects these.
+The learnt displacement is the free run plus a sum of terms theta_j f_j.  Each f_j is the response
+to one change of the model.  The model may change its gain, the weights of its plays (by hats over
+their thresholds), its cubic, or the gains of its creep.  A changed model runs for each f_j, so
+amplifier, creep, G and delay act on the change as they act on the stage.  A high-pass removes
+offset, drift and creep of earlier motion from the f_j and from the measured error; the observer
+corrects these.
 
 Recursive least squares fit theta to the means f of groups of samples.  Old information fades only
 for the theta_j that a group informs about, and never below the information of the prior:

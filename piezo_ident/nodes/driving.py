@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node that drives by a tracker: the right to drive, ramps to rest, faults, and a safe end."""
+"""Base of a node that drives with a tracker: right to drive, ramps to rest, faults, safe end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
 #: period of the timer that waits, ramps and watches [s]
 PERIOD = 0.01
-#: states in which the node holds the right to drive, and what it does in them
+#: states in which the node holds or awaits the right to drive, with their meaning for people
 NOW = {
     'waiting': 'waiting for subscribers',
     'ready': 'waiting for a reference',
@@ -36,19 +36,19 @@ class DrivingNode(LabNode):
     """
     Holds the right to drive between a start and the rest after a stop.
 
-    A subclass has a tracker when it drives, does its work in `work`, and tells its state in
-    `report_state`.
+    A subclass sets a tracker before it drives, does its work in `work`, and publishes its state
+    in `report_state`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         self._state: str = 'idle'
         self._end = ('', '')
-        # what went wrong on the way to the end
+        # the faults of the last drive
         self._caveats = ''
         super().__init__(**kwargs)
         self._rate_of_clock = self.values['sample_rate']
         self._tracker: Tracker | None = None
-        # why a model was not taken
+        # the reason for refusing the last model
         self._refusal = ''
         self._faults = RecentFaults()
         self._counts = self._faults.counts
@@ -61,7 +61,7 @@ class DrivingNode(LabNode):
         """Publish the status."""
 
     def work(self) -> str:
-        """Do what is due; return the state to go to when the right to drive has just come."""
+        """Do the due work; return the next state if the right to drive has just come."""
         return ''
 
     def _take_right(self, tracker: Tracker) -> None:
@@ -142,7 +142,7 @@ class DrivingNode(LabNode):
         tracker, begin, sent = self._tracker, time.monotonic(), 0
         size = max(1, round(PERIOD * self._rate_of_clock))
         if tracker is not None:
-            # a ramp that is under way at its own pace gives way to one that ends in time
+            # replaces a slow ramp by a ramp that ends in time
             tracker.hurry()
         while tracker is not None and self._output.is_open and not tracker.is_at_rest:
             self._send(*tracker.idle(size, LAST_RAMP), 'ramp:stop')

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-SIGINT and SIGTERM, heard by a thread from the first line of a process on.
+End a process on SIGINT or SIGTERM, from the first line of its code on.
 
-A Python signal handler waits until the main thread is back from what it does, and that may be a
-compiler.  The thread hears a signal at once.  A process that has nothing to close yet ends there
-and then; one that has gets some time for it, and is ended when that is over.
+A Python signal handler waits for the main thread, which may be busy in a compiler.  The thread of
+this module hears a signal at once.  A process without anything to close ends at once.  Any other
+process gets some time to close, after which it is ended.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Ending:
     on_wanted : callable
         Called once, in another thread, after `is_wanted` was set.
     unfinished : str
-        What is cut off when the process has to be ended; then the exit code is 1.
+        Work that is cut off if the process has to be ended; the exit code is then 1.
     """
 
     def __init__(self) -> None:
@@ -45,13 +45,13 @@ class Ending:
         self._is_listening = False
 
     def listen(self) -> None:
-        """Take the two signals; from the main thread."""
+        """Take over the two signals; only the main thread may call this."""
         if self._is_listening:
             return
         self._is_listening = True
         heard, told = os.pipe()
         os.set_blocking(told, False)
-        # written to by the handler in C, at once
+        # the handler in C writes to it at once
         signal.set_wakeup_fd(told, warn_on_full_buffer=False)
         for number in SIGNALS:
             signal.signal(number, _nothing)
@@ -72,12 +72,12 @@ class Ending:
     @staticmethod
     def leave(code: int) -> None:
         """
-        End the process without taking its interpreter down.
+        End the process without shutting down its interpreter.
 
-        That takes long on a busy machine, and a signal that comes meanwhile kills the process.
+        The shutdown takes long on a busy machine, and a signal during it kills the process.
         """
         for stream in (sys.stdout, sys.stderr):
-            # closed by whoever started the process, or full
+            # the stream may be closed, or its disk full
             try:
                 stream.flush()
             except (AttributeError, OSError, ValueError):
@@ -89,5 +89,5 @@ def _nothing(*_: object) -> None:
     """Do nothing."""
 
 
-#: there is one for a process, as there is one set of signal handlers
+#: the only instance, as a process has one set of signal handlers
 ENDING = Ending()

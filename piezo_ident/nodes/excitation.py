@@ -2,24 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The excitation node: plays programs on `voltage`, or on `reference` for the feedforward node.
+Excitation node: plays programs on `voltage`, or on `reference` for the feedforward node.
 
-Nothing is sent before ``~/start``.  The clock of the samples starts at zero with every program; a
-block is sent when its first sample is due, counted from the first one.  `rate_factor` makes that
-schedule faster or slower; nobody is waited for, and each listener reports what it lost.
+The node sends only after ``~/start``.  The clock of the samples starts at zero with every program.
+A block is sent when its first sample is due on this clock.  `rate_factor` makes the schedule
+faster or slower.  The node waits for no listener; each listener reports its losses.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
-and SIGTERM do the same within a second, steeper than `ramp_slew` where that would take longer.
-A ramp runs in real time.
+and SIGTERM ramp to rest within a second, if necessary steeper than `ramp_slew`.  A ramp runs in
+real time.
 
-With `axes` several axes are driven at once, each with random signals of its own, on topics of
-their own: `voltage_b` for axis `b`.  All of them begin, end and stop together.
+With `axes` the node drives several axes at once, each on its own topic with its own random
+signals: `voltage_b` for axis `b`.  All axes begin, end and stop together.
 
-Two programs at once would tear the stage to and fro, so a second publisher on `voltage` is
-refused at the start, and reported when it comes later.  An excitation that was killed is seen by
-the middleware for some 20 s more: a publisher under this node's own name that is silent is taken
-for that.  Before the first block this node therefore listens for half a second.  Two that start
-at the same moment, as two of one name do, hear each other in their first second, and both end.
+Two programs at once would tear the stage to and fro.  The node therefore refuses to start beside a
+second publisher on `voltage`, and reports a later one.  The middleware still lists a killed
+excitation for some 20 s.  The node takes a silent publisher under its own name for such a remnant,
+and listens for half a second before the first block.  Two nodes of one name that start at the same
+moment hear each other in their first second, and both end.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.channels import role_of
 
-#: unit of a program, and what it is in SI
+#: unit of a program, and its factor to the SI unit
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
 #: the unit in the messages of a program
 _VOLTS = re.compile(r'(?<= )V\b')
 #: most blocks that are sent at once after a delay
 CATCH_UP = 50
-#: share of the voltage limits below which it is said what a program drives
+#: share of the voltage range below which the answer to ~/start names the range of a program
 NARROW = 0.5
 
 
 def read_program(text: str) -> Program:
     """
-    Return the program that a parameter names or contains.
+    Read the program that a parameter names or contains.
 
     Raises
     ------
     ConfigError
-        When there is none.
+        When the program does not exist or has a fault.
     """
     if '\n' in text or ('segments' in text and ':' in text):
         return parse_program(text)
@@ -94,7 +94,7 @@ class Playing:
 
     @property
     def sequence(self) -> Sequence:
-        """That of the first axis; all have the same segments."""
+        """Sequence of the first axis; all axes have the same segments."""
         return self.sequences[0]
 
 
@@ -116,11 +116,11 @@ class ExcitationNode(LabNode):
         super().__init__(**kwargs)
         self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
         self._build(self.values['program'])
-        # loads the kernel: the ramp of a stop, or of the end, must not wait for it
+        # loads the kernel, so that a ramp to rest need not wait for it
         Guard(self._guard_settings())
         self._quantity = self.values['quantity']
         self._unit, self._scale = UNITS[self._quantity]
-        # behind the quantity, what belongs to an axis
+        # the topic of an axis is the quantity with the tail of the axis
         self._outputs = [
             ExclusivePublisher(self, f'{self._quantity}{tail}', stays=True) for tail in self._tails
         ]
@@ -137,7 +137,7 @@ class ExcitationNode(LabNode):
             return None if bad is None else f'axes: {bad!r} cannot be the name of an axis'
         if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
             return None
-        # while parameters are declared, those that come later are not there yet
+        # not all parameters are declared yet
         if not {'program', 'voltage_low', 'voltage_high', 'rest'} <= self.values.keys():
             return None
         if name != 'program' and self._is_playing():
@@ -150,7 +150,7 @@ class ExcitationNode(LabNode):
         values = values or self.values
         limits = (values['voltage_low'], values['voltage_high'])
         key = (text, limits)
-        # a file may have changed since
+        # a file may have changed, so it is read again
         if self._built is None or self._built[0] != key or '\n' not in text:
             try:
                 count = 1 + sum(map(bool, values.get('axes', ())))
@@ -164,7 +164,7 @@ class ExcitationNode(LabNode):
         return self._built[1]
 
     def _in_unit(self, error: ConfigError) -> ConfigError:
-        """Return an error of a program, whose unit may be another than the volts of most."""
+        """Replace V in the error of a program by the unit of the quantity."""
         unit = UNITS[self.values['quantity']][0]
         return ConfigError(_VOLTS.sub(unit, str(error)))
 
@@ -177,7 +177,7 @@ class ExcitationNode(LabNode):
 
     def _is_playing(self) -> bool:
         thread, playing = self._thread, self._playing
-        # the thread lives on for a moment after it has said so
+        # the thread lives on for a moment after its last status
         is_over = playing is not None and playing.is_over
         return thread is not None and thread.is_alive() and not is_over
 
@@ -207,14 +207,14 @@ class ExcitationNode(LabNode):
         )
 
     def _other_rate(self, sequence: Sequence) -> str:
-        """Say where the rate of this node takes the place of that of the program."""
+        """Say if this node plays a program at another rate than the program names."""
         own, rate = read_program(self.values['program']).sample_rate, sequence.sample_rate
         if own is None or own == rate:
             return ''
         return f'; at the {rate:g} Hz of this node, not at the {own:g} Hz of the program'
 
     def _unused(self, sequence: Sequence) -> str:
-        """Say where a program leaves most of the range alone, as one of 0 .. 10 V does."""
+        """Say if a program drives less than `NARROW` of the voltage range."""
         low, high = float(sequence.v.min()), float(sequence.v.max())
         limits = self.values['voltage_low'], self.values['voltage_high']
         if self._quantity != 'voltage' or high - low >= NARROW * (limits[1] - limits[0]):
@@ -250,7 +250,7 @@ class ExcitationNode(LabNode):
     def _end(
         self, playing: Playing, state: str, progress: float, message: str, level: bytes = OK
     ) -> None:
-        """Say what came of it; whoever hears that may start again."""
+        """Report the result; the next start may follow at once."""
         playing.is_over = True
         self.report_status(state, progress, message, level, samples=playing.tick)
 
@@ -267,7 +267,7 @@ class ExcitationNode(LabNode):
     def _play(self, playing: Playing) -> None:
         sequence = playing.sequence
         speed = playing.factor * sequence.sample_rate
-        # what is caught up with at once must fit into the queues of the readers
+        # blocks that are sent late all at once must fit into the queues of the readers
         slip = min(SLIP, CATCH_UP * playing.block_size / speed)
         clock = Schedule(speed, time.monotonic(), slip)
         playing.clock = clock
@@ -297,7 +297,7 @@ class ExcitationNode(LabNode):
         playing.work = time.perf_counter() - begin
 
     def _ramp(self, playing: Playing, state: str, message: str) -> None:
-        """Go to rest from wherever we are, in real time, and say what came of it."""
+        """Ramp to rest from the last voltage, in real time, and report the result."""
         settings = self._guard_settings()
         level = WARN if state == 'failed' else OK
         progress = math.floor(100.0 * playing.tick / playing.sequence.n)
@@ -312,12 +312,12 @@ class ExcitationNode(LabNode):
         settings = guards[0].settings
         hurried, origin = False, playing.tick
         clock = playing.clock = Schedule(settings.sample_rate, time.monotonic())
-        # short blocks even where those of the program are long: the end must not wait
+        # short blocks, whatever the size in the program: the end must not wait
         size = min(playing.block_size, max(1, round(0.005 * settings.sample_rate)))
         while not all(guard.is_at_rest for guard in guards):
             if playing.hurry and not hurried:
                 guards, hurried = [Guard(settings, guard.applied) for guard in guards], True
-                # all of it fits into the queues of the readers: what held it up is caught up with
+                # the whole ramp fits into the queues of the readers, so every delay is made up
                 size, origin = max(1, round(0.01 * settings.sample_rate)), playing.tick
                 clock = playing.clock = Schedule(clock.speed, time.monotonic(), math.inf)
             longest = LAST_RAMP if hurried else math.inf
@@ -372,7 +372,7 @@ class ExcitationNode(LabNode):
         if playing is not None and self._thread is not None:
             playing.hurry = True
             playing.stop.set()
-            # the node is ended with an error when that takes too long
+            # `ENDING` ends the node with an error if this takes too long
             self._thread.join()
             for output in self._outputs:
                 output.close()

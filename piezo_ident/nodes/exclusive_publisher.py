@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The right to drive: a publisher that sends only where nobody else does.
+Publish only while no other publisher sends: the right to drive.
 
-A publisher is known by its id, not by its name: two nodes may have the same one.  The middleware
-does not tell which publisher sent a message.  But each listener gets a message once, so whoever
-hears more messages than it has sent hears somebody else.
+Publishers differ by their ids; two nodes may have the same name.  The middleware does not say
+which publisher sent a message.  But a listener gets each message once.  A node that hears more
+messages than it has sent therefore hears another publisher.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-#: how long to listen whether somebody else drives [s]
+#: time of listening for another publisher before the first block [s]
 LISTEN = 0.5
-#: how long it may take to match all publishers [s]
+#: longest time to match all publishers [s]
 MEET = 2.0
-#: how long it takes a new node to know of most others [s]
+#: time after which a new node knows most other nodes [s]
 YOUTH = 1.0
-#: how long two that ask for it at the same moment may take to hear each other's first blocks [s]
+#: time in which two nodes that start at the same moment hear each other's first blocks [s]
 TOGETHER = 1.0
-#: between the match of a subscriber and the first block, for the other side to know of it too [s]
+#: time between the match of a subscriber and the first block, so that both sides know the match
+#: [s]
 SETTLE = 0.1
 
 
@@ -45,14 +46,14 @@ class ExclusivePublisher:
     node : Node
     topic : str
     stays : bool, optional
-        Whether the publisher is there between two drives too.  It then refuses any other one by
-        its name; without, one that is silent is no hindrance, as an excitation between two
-        programs, which does not start beside this one.
+        Whether the publisher exists between two drives, too.  It then refuses to drive beside any
+        publisher of another node name.  Without `stays` it drives beside a silent publisher, such
+        as an excitation between two programs, which in turn does not start beside this one.
 
     Attributes
     ----------
     topic : str
-        Its full name.
+        Full name of the topic.
     """
 
     def __init__(self, node: Node, topic: str, *, stays: bool = False) -> None:
@@ -67,7 +68,7 @@ class ExclusivePublisher:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a publisher."""
+        """Whether the publisher exists."""
         return self._publisher is not None
 
     def _created(self) -> Any:
@@ -75,14 +76,14 @@ class ExclusivePublisher:
 
     def open(self) -> None:
         """
-        Ask for the right to drive, by the executor of the node; `poll` tells when it is there.
+        Ask for the right to drive, in the executor of the node; `poll` says when it is granted.
 
         Raises
         ------
         ConfigError
-            When any other publisher is to be refused, and there is one.
+            When another publisher exists, with `stays`.
         """
-        # who has no name yet may have the same one
+        # a node without a known name yet may have the own name
         self._refuse(name for name in self.others() if name != UNNAMED)
         self.stop_listening()
         self._begin, self._met, self._free = time.monotonic(), 0.0, 0.0
@@ -93,12 +94,12 @@ class ExclusivePublisher:
 
     def poll(self, subscribers: int, limit: float) -> bool:
         """
-        Return whether blocks may be sent; from any thread.
+        Return whether blocks may be sent; any thread may call this.
 
         Raises
         ------
         ConfigError
-            When somebody else drives, or too few listen within the limit [s].
+            When another publisher drives, or too few listen within the limit [s].
         """
         now = time.monotonic()
         self.refuse_foreign_blocks()
@@ -125,19 +126,19 @@ class ExclusivePublisher:
 
     def refuse_foreign_blocks(self) -> None:
         """
-        Look for blocks of somebody else; from the thread that sends.
+        Look for blocks of another publisher; the thread that sends calls this.
 
-        While the right to drive is waited for, and for `TOGETHER` after it was given: two that
-        ask for it at the same moment hear each other only when both send.
+        The search lasts until `TOGETHER` after the right to drive was granted.  Two nodes that ask
+        for it at the same moment hear each other only when both send.
 
         Raises
         ------
         ConfigError
-            When there are any.
+            When another publisher has sent a block.
         """
         with self._lock:
             listener = self._listener
-            # one is enough: somebody may send faster than they are taken
+            # one foreign block is enough: blocks may come faster than they are taken
             while listener and self._heard <= self._sent:
                 if listener.handle.take_message(Float64MultiArray, True) is None:
                     break
@@ -153,8 +154,8 @@ class ExclusivePublisher:
             self.stop_listening()
 
     def _await_publishers(self, now: float) -> None:
-        """Note when every publisher is matched: silence before says nothing."""
-        # a node that has just come up does not even know of them
+        """Note when every publisher is matched; silence counts from then on."""
+        # a new node does not know the other publishers at first
         begin = max(self._begin, self._born + YOUTH)
         known, listener = self._node.count_publishers(self.topic), self._listener
         is_matched = listener is None or listener.get_publisher_count() >= known
@@ -174,18 +175,18 @@ class ExclusivePublisher:
         self._publisher.publish(to_message(samples))
 
     def others(self) -> list[str]:
-        """Return the other publishers; a namesake may be one that was killed."""
+        """Return the nodes of the other publishers, without the own name, which a killed node keeps."""
         own = self._node.get_fully_qualified_name()
         return sorted(set(publishers(self._node, self.topic).values()) - {own})
 
     def second(self) -> str:
-        """Return a publisher that came since the right was given, empty without one."""
+        """Return the node of a publisher that came after the right was granted, or ''."""
         now = publishers(self._node, self.topic) if self._free else {}
         new = (name for gid, name in now.items() if gid not in self._known)
         return min((name for name in new if name != UNNAMED), default='')
 
     def stop_listening(self) -> None:
-        """Drop the listener, between two turns of the executor: it gets all that is sent here."""
+        """Drop the listener, which costs time with each block, between two turns of the executor."""
         with self._lock:
             listener, self._listener = self._listener, None
         if listener is not None:

@@ -2,33 +2,33 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The feedforward node: the voltage under which the stage goes where `reference` tells it.
+Feedforward node: makes the voltage that moves the stage along `reference`.
 
-``~/start`` takes the right to drive; from then on each block of `reference` is answered by one of
-`voltage`, with its own clock from zero, for the reference `preview` seconds before.  The reference
-is joined from rest along a raised cosine.  When it is silent for `silence`, what is still ahead is
-played, and the node ramps to rest; ``~/stop``, SIGINT and SIGTERM ramp at once, as the excitation
-does.  Nothing leaves the limits, nor is faster than `slew`.
+``~/start`` takes the right to drive.  The node then answers each block of `reference` by a block
+of `voltage`.  The voltage has its own clock from zero, and belongs to the reference `preview`
+seconds before.  The node joins the reference from rest along a raised cosine.  When the reference
+is silent for `silence`, the node plays its rest and ramps to rest.  ``~/stop``, SIGINT and SIGTERM
+ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
 
-``~/learn`` repeats the last reference, corrects the voltage by what was measured, and ends when
-the error falls no more; called again, it goes on from the best.
+``~/learn`` repeats the last reference, corrects the voltage by the measured error, and ends when
+the error stops falling.  A further call goes on from the best repetition.
 
 With `follow` an observer finds offset, creep of earlier motion, and gain in the displacement, and
-the voltage makes up for them.
+the node corrects the voltage by them.
 
-A model that is refined takes over while the stage moves: without a step in the voltage, and with
-the memory that it would have if it had run from the start.
+A refined model takes over while the stage moves.  The voltage does not step, and the model has the
+memory that it would have if it had run from the start.
 
 | in the reference | what happens | status |
 |---|---|---|
 | layout of no block, stamps off the clock, a block that came before, a second publisher, far \
 from the stage, as in micrometres | the block is refused | WARN |
-| a sample that is no number | the last one stays in force | WARN |
+| a sample that is NaN or infinite | the last sample is repeated | WARN |
 | a gap up to `silence` | a straight line | WARN |
 | another stream | is joined from where the first one ended | |
 | out of reach | the voltage stays at its limit | WARN |
 
-Where no displacement comes while it drives, it drives on, warns, and has no tracking error.
+Without displacement the node drives on, warns, and has no tracking error.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_messa
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
-#: parameters that are taken over between two references
+#: parameters that cannot be changed while the node drives
 LIMITS = ('voltage_low', 'voltage_high', 'rest', 'slew', 'ramp_slew', 'follow')
 #: faults whose samples or blocks are counted
 FAULTS = ('lost', 'refused', 'not_finite', 'clipped')
-#: how long a stage may answer nothing to a reference that goes on, before it is told [s]
+#: longest silence of the stage during a reference, before a warning [s]
 SILENT = 1.0
-#: what is told where more is not made up for
+#: warning when a correction reaches its limit
 LIMITED = f'the stage is off by {MOST:.0%} of its stroke or more: is the sensor right?'
 
 
@@ -77,10 +77,10 @@ class FeedforwardNode(DrivingNode):
         self._model: StageModel | None = None
         self._source, self._models = '', 0
         self._segment = ''
-        # labels of the reference, and from which sample on
+        # labels of the reference, each with its first sample
         self._labels: deque[tuple[int, str]] = deque()
         self._heard = 0
-        # the last reference, its length, and what was learned of it
+        # the last reference, its length, and the learning of it
         self._kept: list[NDArray[np.float64]] = []
         self._length, self._last_value = 0, 0.0
         self._learner: Learner | None = None
@@ -130,7 +130,7 @@ class FeedforwardNode(DrivingNode):
             self._loader.load(self._source, lambda: model)
 
     def _prepared(self, model: StageModel) -> tuple[StageModel, Tracker | Successor]:
-        # by the thread of the loader
+        # runs in the thread of the loader
         tracker, settings, follow = self._tracker, self._settings(), self.values['follow']
         if tracker is None or (tracker.settings, tracker.follow) != (settings, follow):
             preview = max(1, round(self.values['preview'] * self._rate_of_clock))
@@ -266,7 +266,7 @@ class FeedforwardNode(DrivingNode):
         self._tell(self._error.wanted(wanted))
 
     def _label(self, t: NDArray[np.float64]) -> str:
-        """Return the label of what the stage is to do at the first of these times."""
+        """Return the label of the reference that belongs to the first of these times."""
         labels, preview = self._labels, self.values['preview']
         at = round((float(t[0]) - preview) * self._rate_of_clock)
         while len(labels) > 1 and labels[1][0] <= at:
@@ -279,7 +279,7 @@ class FeedforwardNode(DrivingNode):
         self._tell(self._error.wanted(wanted))
 
     def _on_displacement(self, message: Float64MultiArray) -> None:
-        # a stage that is late answers the last of it when the node is at rest
+        # a slow stage may answer the last blocks when the node is at rest already
         if self._state not in ('tracking', 'learning', 'stopping') and not self._error.is_waiting:
             return
         try:
@@ -354,16 +354,16 @@ class FeedforwardNode(DrivingNode):
         )
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return rate, what was lost and refused, head-room, and the tracking error."""
-        # where the reference pauses there is nothing to answer
+        """Return rate, counts of lost and refused samples, head-room, and tracking error."""
+        # while the reference pauses, the stage has no block to answer
         if self._state == 'tracking' and self._last - self._answered > SILENT:
-            # what was found before says nothing of now
+            # the earlier error says nothing about the present
             self._error.live.clear()
             self._faults.note('silent', 'no displacement comes from the stage', 0)
         if outliers := self._error.live.outliers:
             about = 'wild readings of displacement are left out of the tracking error'
             self._faults.note('outliers', f'{outliers} {about}', 0)
-        # a figure that changed with each block would flood the status
+        # updated once a second: a new figure with each block would flood the status
         self._told = self._error.percent
         self.report_state()
         rate, worked = self._rate.of(self._counts['samples']), self._work_rate.of(self._busy)

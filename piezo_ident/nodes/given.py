@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a node is given, when it starts and while it runs: arguments and parameters.
+Check the arguments and parameters of a node, at its start and while it runs.
 
-ROS passes over a parameter or an argument that nobody knows without a word.  Of several
-parameters in one request it judges each alone, against the old values of the others.
+ROS silently ignores unknown parameters and arguments.  It also checks each parameter of a request
+alone, against the old values of the others.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def begin() -> None:
     """
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    # of which the classes of rcl's errors are
+    # the base class of the errors of rcl
     except RuntimeError as error:
         # without the places in the sources of rcl
         text = re.sub(r', at /\S+:\d+|failed to initialize rcl: ', '', str(error))
@@ -56,7 +56,7 @@ def begin() -> None:
 
 
 def home_problem(path: str) -> str | None:
-    """Return what is wrong with the home folder with which a path begins, None when nothing is."""
+    """Return the problem if a path begins with an unknown home folder, else None."""
     try:
         Path(path).expanduser()
     except RuntimeError:
@@ -65,7 +65,7 @@ def home_problem(path: str) -> str | None:
 
 
 def no_parameter(node: Node, name: str) -> str:
-    """Return that a node has no such parameter, and the name that may be meant."""
+    """Say that a node has no such parameter, and guess the intended name."""
     known = node.list_parameters([], 0).names
     close = difflib.get_close_matches(name, known, n=1)
     guess = f'; did you mean {close[0]}?' if close else ''
@@ -73,7 +73,7 @@ def no_parameter(node: Node, name: str) -> str:
 
 
 def unknown_to(node: Node) -> Iterator[str]:
-    """Return a line on each parameter and argument that was given and that the node has not."""
+    """Yield a line for each given parameter or argument that the node does not know."""
     given = getattr(node, '_parameter_overrides', ())
     yield from (no_parameter(node, name) for name in sorted(given) if not node.has_parameter(name))
     rest = remove_ros_args(args=sys.argv)[1:]
@@ -82,7 +82,7 @@ def unknown_to(node: Node) -> Iterator[str]:
 
 
 class _Together(ParameterService):
-    """Lets the node judge all parameters of a request, as ``ros2 param load`` sends, at once."""
+    """Service that lets a node check all parameters of a request at once (``ros2 param load``)."""
 
     def _set_parameters_callback(
         self, request: SetParameters.Request, response: SetParameters.Response
@@ -94,16 +94,16 @@ class _Together(ParameterService):
 
 class ParameterNode(Node):
     """
-    A node that declares its parameters by `Declaration`, and judges them together.
+    Node that declares its parameters by `Declaration`, and checks them together.
 
     A subclass refuses values in `refuse` and acts on them in `apply`.
 
     Attributes
     ----------
     values : dict
-        Of all parameters.
+        Values of all parameters.
     wanted : dict
-        The same as they would be with what is just being set.
+        The values that a request would lead to, while it is checked.
     journal : Journal
     """
 
@@ -149,7 +149,7 @@ class ParameterNode(Node):
         self.values[declaration.name] = parameter.value
 
     def _problem(self, name: str, value: Any) -> str | None:
-        """Return what is wrong with a value, None when nothing is."""
+        """Return the problem of a value, or None."""
         declaration = self._declared.get(name)
         if declaration is None:
             return None
@@ -163,7 +163,7 @@ class ParameterNode(Node):
             return str(error)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters; those that cannot be changed may be set to what they are."""
+        """Set all parameters or none; a read-only parameter may be set to its present value."""
         result = self._set(parameter_list)
         if not result.successful:
             self.journal.tell(f'parameter refused: {result.reason}', DiagnosticStatus.WARN)
@@ -171,9 +171,9 @@ class ParameterNode(Node):
 
     def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
         """
-        Set all parameters at once, or else each that can be set, in an order in which it can.
+        Set all parameters at once, or else as many as possible, in any order that works.
 
-        A file that is loaded moves limits that belong together, and names them one by one.
+        A loaded file may move limits that belong together, and it names them one by one.
         """
         together = self._set(parameter_list)
         if together.successful:
@@ -185,14 +185,14 @@ class ParameterNode(Node):
             refused = [k for k in left if not results[k].successful]
             if len(refused) == len(left):
                 break
-            # what was just set may have been in the way of those
+            # a parameter that was just set may have prevented the others
             left = refused
         for k in left:
             self.journal.tell(f'parameter refused: {results[k].reason}', DiagnosticStatus.WARN)
         return [results[k] for k in range(len(parameter_list))]
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        # as a file does that is loaded and holds all
+        # a loaded file also names the read-only parameters
         wanted = [
             p
             for p in parameters
@@ -207,7 +207,7 @@ class ParameterNode(Node):
         return super().set_parameters_atomically(wanted)
 
     def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        # two that come at once may each fit what is there, and not each other
+        # two new values may each fit the present values, but not each other
         self.wanted = {**self.values, **{p.name: p.value for p in parameters}}
         for parameter in parameters:
             problem = self._problem(parameter.name, parameter.value)
@@ -223,7 +223,7 @@ class ParameterNode(Node):
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Return or raise why a value of a parameter cannot be taken, if so; see `wanted`."""
+        """Return or raise the reason for refusing a value; None accepts it.  See `wanted`."""
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a node writes to its log and tells in its status: what is new, and not what goes on."""
+"""Write news of a node to its log and its status, without repeating lasting problems."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.common.errors import printable
 
-#: for how long a line that differs from an earlier one in its numbers alone is left out [s]
+#: time for which a line is left out that differs from an earlier line only in numbers [s]
 QUIET = 10.0
-#: for how long the very same line is left out [s]
+#: time for which an identical line is left out [s]
 ECHO = 1.0
-#: how long a fault stays in the status [s]
+#: time for which a fault stays in the status [s]
 FAULT_SHOWN = 3.0
-#: how many lines are remembered; what comes beyond them, as under a flood, is left out
+#: most remembered lines; in a flood of lines the further ones are left out
 MOST = 50
 #: longest line, as of a parameter that holds a program
 LONGEST = 500
@@ -35,12 +35,12 @@ _NUMBER = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?')
 
 class RecentFaults:
     """
-    What went wrong in a stream: how often, and of each fault the last message for some seconds.
+    Faults of a stream: their counts, and the last message of each fault for some seconds.
 
     Attributes
     ----------
     counts : Counter
-        By fault.
+        Number of occurrences by fault.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class RecentFaults:
         self._all.clear()
 
     def note(self, fault: str, message: str, count: int = 1) -> None:
-        """Take note of a fault that was met so often."""
+        """Note `count` occurrences of a fault."""
         self.counts[fault] += count
         self._latest[fault] = (message, time.monotonic() + FAULT_SHOWN)
         self._all[fault] = message
@@ -75,7 +75,7 @@ class RecentFaults:
 
 class Journal:
     """
-    The log of a node; from any thread.
+    Log of a node; any thread may write to it.
 
     Parameters
     ----------
@@ -85,13 +85,13 @@ class Journal:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self._lock = threading.Lock()
-        # until when lines, and lines without their numbers, are left out
+        # the time until which a line, and a line without its numbers, is left out
         self._lines: dict[str, float] = {}
         self._patterns: dict[str, float] = {}
 
     def tell(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
         """
-        Write something that happened once.
+        Write a single event.
 
         Parameters
         ----------
@@ -110,14 +110,14 @@ class Journal:
             self._write(line, level)
 
     def warn(self, text: str, level: bytes = DiagnosticStatus.WARN) -> None:
-        """Write what may hold on, and is found again and again with other numbers."""
+        """Write a problem that may last, and comes again and again with other numbers."""
         new = []
         with self._lock:
             patterns = _fresh(self._patterns)
-            # a list of problems grows one by one
+            # the text lists several problems
             for part in one_line(text).split('; '):
                 pattern = _NUMBER.sub('#', part)
-                # a part of what was told is no news
+                # a part of an earlier line is old news
                 known = next((p for p in patterns if pattern in p), None)
                 if known is None and len(patterns) < MOST:
                     new.append(part)
@@ -136,7 +136,7 @@ class Journal:
 
 
 class FromPackage(logging.Handler):
-    """Puts what the package logs, such as that it compiles, into the journal of a node."""
+    """Handler that passes log records of the package, such as compiling, to a journal."""
 
     def __init__(self, journal: Journal) -> None:
         super().__init__()
@@ -148,13 +148,13 @@ class FromPackage(logging.Handler):
 
 
 def one_line(text: str, longest: int = LONGEST) -> str:
-    """Return a text in one line, cut where it is too long."""
+    """Put a text into one line, cut if it is too long."""
     line = ' '.join(printable(text).split())
     return line if len(line) <= longest else f'{line[: longest - 4].rstrip()} ...'
 
 
 def shortened(text: str, longest: int) -> str:
-    """Return a text in one line, with the ends of long paths alone, cut where it is too long."""
+    """Put a text into one line, with long paths cut at their front, and cut at its end."""
 
     def end(match: re.Match[str]) -> str:
         path = match[0]
@@ -164,12 +164,12 @@ def shortened(text: str, longest: int) -> str:
 
 
 def shown(values: Mapping[str, Any]) -> str:
-    """Return parameters as text; one may hold a whole program."""
+    """Format parameters, shortened: a parameter may hold a whole program."""
     return ', '.join(f'{name} = {shortened(str(value), 60)}' for name, value in values.items())
 
 
 def _fresh(told: dict[str, float]) -> dict[str, float]:
-    """Forget what may be told again."""
+    """Forget lines whose time is over."""
     now = time.monotonic()
     for line in [line for line, until in told.items() if until <= now]:
         del told[line]

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What all nodes share: parameters, status, diagnostics, services that answer at once, a clean end.
+Base of all nodes: parameters, status, diagnostics, services that answer at once, a clean end.
 
-rclpy's own signal handlers shut the context down before a node can ramp its drive to rest, so
-the signals are taken by `piezo_ident.nodes.ending`.
+The signal handlers of rclpy shut the context down before a node can ramp its drive to rest.
+`piezo_ident.nodes.ending` therefore takes the signals.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import threading
 import traceback
 from typing import Any
 
-# before numpy is loaded: tall, narrow factorisations only get slower on more threads
+# set before numpy is loaded: more threads slow down tall, narrow factorisations
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -39,18 +39,18 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-#: how long a thread may keep the interpreter while another one waits for it [s]
+#: longest time for which a thread keeps the interpreter while another thread waits [s]
 SWITCH = 2e-4
-#: how long a node may go on being made, and how long it may take to close, after a signal [s]
+#: longest time after a signal for finishing the start of a node, and for closing it [s]
 STARTING, CLOSING = 1.0, 1.8
 #: most characters of a message: ``ros2 topic echo`` cuts a text at 128
 LONGEST = 100
-#: callbacks in a row that fail before a node gives up
+#: number of consecutive failed callbacks after which a node gives up
 MOST_FAILURES = 1000
 
 
 def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettings:
-    """Return the settings of a guard from the parameters of a node that drives."""
+    """Make the settings of a guard from the parameters of a node that drives."""
     v = values
     return GuardSettings(
         v['voltage_low'], v['voltage_high'], v['slew'], v['ramp_slew'], v['rest'], sample_rate
@@ -59,14 +59,14 @@ def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettin
 
 class LabNode(ParameterNode):
     """
-    A node of the graph.
+    Node of the graph.
 
     A subclass names its executable, offers services with `offer`, reports with `report_status`,
-    fills `diagnose`, applies parameters in `apply`, and gives way in `close`.
+    overrides `diagnose`, applies parameters in `apply`, and closes in `close`.
     """
 
     executable: str
-    #: how long it may take to close [s]
+    #: longest time for closing [s]
     patience = CLOSING
 
     def __init__(self, **kwargs: Any) -> None:
@@ -74,7 +74,7 @@ class LabNode(ParameterNode):
         self._status_lock = threading.Lock()
         self._last_status: tuple[Any, ...] = ()
         logging.getLogger('piezo_ident').addHandler(FromPackage(self.journal))
-        # a timer of the ROS clock would stand still when somebody sets use_sim_time
+        # a timer of the ROS clock would stand still with use_sim_time
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._status = self.create_publisher(DiagnosticStatus, '~/status', LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', PREVIEW)
@@ -83,7 +83,7 @@ class LabNode(ParameterNode):
         self.report_status('idle', 0.0, 'ready')
 
     def create_timer(self, *args: Any, **kwargs: Any) -> Any:
-        """Create a timer that goes by the clock of the machine, whatever ROS time does."""
+        """Create a timer on the steady clock of the machine, independent of ROS time."""
         return super().create_timer(*args, **{'clock': self._steady, **kwargs})
 
     # status, diagnostics, services
@@ -102,7 +102,7 @@ class LabNode(ParameterNode):
         """
         Publish the latched status.
 
-        The prose is the last value.  The message fits ``ros2 topic echo``, its figure first.
+        The text is the last value.  The message begins with a figure and fits ``ros2 topic echo``.
 
         Parameters
         ----------
@@ -115,9 +115,9 @@ class LabNode(ParameterNode):
         level : bytes, optional
             As in diagnostic_msgs/DiagnosticStatus.
         brief : str, optional
-            The same in few words, a number first; the progress and the text by default.
+            The text in few words, a number first; default: the progress and the text.
         problems : str, optional
-            What of the text is wrong and goes to the log; all by default.
+            Part of the text that goes to the log as a warning; default: the whole text.
         **values
             Further numbers.
         """
@@ -176,7 +176,7 @@ class LabNode(ParameterNode):
         name : str
             Without the ``~/``.
         handler : callable
-            Starts the work and returns what to say; raises `PiezoIdentError` to refuse.
+            Starts the work and returns the answer; raises `PiezoIdentError` to refuse.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -186,7 +186,7 @@ class LabNode(ParameterNode):
             except PiezoIdentError as error:
                 response.message, response.success = str(error), False
                 self.journal.tell(f'~/{name} refused: {error}', WARN)
-            # the client gets an answer, whatever failed
+            # the client gets an answer after any failure
             except Exception as error:  # noqa: BLE001
                 _report(self, error)
                 response.message, response.success = f'failed: {error!r}', False
@@ -195,18 +195,18 @@ class LabNode(ParameterNode):
         self.create_service(Trigger, f'~/{name}', answer, qos_profile=SERVICE)
 
     def reason(self, error: Exception) -> str:
-        """Return the reason why a thread ended; an unexpected one goes to the log too."""
+        """Return why a thread ended; an unexpected error goes to the log, too."""
         if isinstance(error, PiezoIdentError):
             return str(error)
         _report(self, error, 'its work ends')
         return repr(error)
 
     def await_listeners(self) -> None:
-        """Wait a moment until the last status was heard."""
+        """Wait a moment until all listeners have the last status."""
         self._status.wait_for_all_acked(Duration(seconds=0.1))
 
     def introduce(self) -> None:
-        """Write that the node is up, which parameters differ from the default, what is unknown."""
+        """Log the version, the parameters that differ from their defaults, and unknown ones."""
         changed = {
             name: value
             for name, value in self.values.items()
@@ -218,11 +218,11 @@ class LabNode(ParameterNode):
             self.journal.tell(line, WARN)
 
     def close(self) -> None:
-        """Give way: ramp to rest, close files, stop threads; called once, before the end."""
+        """Ramp to rest, close files, stop threads; `run` calls this once, before the end."""
 
 
 def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> None:
-    """Say on the log what a callback tripped over."""
+    """Log the error of a callback."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     place = f'{where.name}, {Path(where.filename).name} line {where.lineno}'
     node.get_logger().error(
@@ -233,7 +233,7 @@ def _report(node: LabNode, error: Exception, then: str = 'the node goes on') -> 
 
 def run(make: Callable[[], LabNode]) -> int:
     """
-    Run a node until SIGINT or SIGTERM, and let it close before the context goes.
+    Run a node until SIGINT or SIGTERM, and close it before the context ends.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ def run(make: Callable[[], LabNode]) -> int:
         Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
         not start.
     """
-    # a thread beside the executor, one that reads YAML say, must not hold a block up for long
+    # another thread, for example reading YAML, must not delay the executor for long
     sys.setswitchinterval(SWITCH)
     ENDING.listen()
     ENDING.patience = STARTING
@@ -292,10 +292,10 @@ def _spin(executor: SingleThreadedExecutor, node: LabNode) -> None:
             failures = 0
         except ExternalShutdownException:
             return
-        # a message from outside must not end the node that holds the drive
+        # a message from outside must not end a node that drives
         except Exception as error:
             failures += 1
             if failures > MOST_FAILURES:
-                # nothing works any more: better to end, at rest
+                # every callback fails: end the node, which ramps to rest
                 raise
             _report(node, error)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Repetitions in real time: played, measured and learned from, one after the other."""
+"""Play the repetitions of a motion in real time, and learn from each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
-#: how long to wait for the next displacement of a repetition that was sent in full [s]
+#: longest wait for the next displacement after a repetition was sent in full [s]
 PATIENCE = 2.0
 
 
@@ -27,9 +27,9 @@ class Learner:
     Parameters
     ----------
     make : callable
-        Returns that; called by a thread.
+        Returns the `LiveLearning`; a thread calls it.
     most : int
-        Repetitions, at most.
+        Most repetitions.
     play : callable
         Gets time, voltage, segment and wanted displacement of the next samples.
 
@@ -38,7 +38,7 @@ class Learner:
     learning : LiveLearning or None
         None until it is made.
     text : str
-        How far it is.
+        Progress, for people.
     is_over : bool
     """
 
@@ -49,7 +49,7 @@ class Learner:
         self.text, self.is_over = 'inverts the reference', False
         self._most, self._play = most, play
         self._count, self._sent, self._tick = 0, 0, 0
-        # while a repetition is on its way
+        # set during a repetition
         self._pace: Pace | None = None
         self._resting = 0.0
         self._failure = ''
@@ -61,7 +61,7 @@ class Learner:
                 work()
             except PiezoIdentError as error:
                 self._failure = str(error)
-            # what fails here must be told by the node, not end its thread silently
+            # the node has to report any failure of this thread
             except Exception as error:  # noqa: BLE001
                 self._failure = f'{type(error).__name__}: {error}'
 
@@ -71,24 +71,24 @@ class Learner:
 
     @property
     def progress(self) -> float:
-        """How much of all repetitions was played [%]."""
+        """Share of the repetitions that was played [%]."""
         return 100.0 * self._count / self._most
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement."""
         if self.learning is not None and self._pace:
             self.learning.measured(samples, self._tick)
-            # a stage that is late, on a busy machine say, is waited for as long as it answers
+            # the wait for a slow stage begins anew with each of its answers
             self._resting = time.monotonic()
 
     def step(self, tracker: Tracker) -> None:
         """
-        Send what is due.
+        Send the due samples, and learn between two repetitions.
 
         Raises
         ------
         ConfigError
-            When nothing can be learned.
+            When learning failed, or displacement is missing.
         """
         if self._thread.is_alive():
             return
@@ -119,7 +119,7 @@ class Learner:
 
     @property
     def is_played(self) -> bool:
-        """Whether a repetition was sent in full, and the stage is to go to rest."""
+        """Whether a repetition was sent in full, so that the stage has to go to rest."""
         learning = self.learning
         return bool(self._pace and learning and self._sent >= learning.voltage.size)
 

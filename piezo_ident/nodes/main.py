@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The executables of the package: one function a node.
+Executables of the package: one function for each node.
 
-A node imports and compiles for seconds, so its module is imported when signals are heard already.
+A node imports and compiles for seconds.  Its module is therefore imported after `ENDING` listens
+for signals.
 """
 
 from __future__ import annotations

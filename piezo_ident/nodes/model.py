@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The model beside the stage: prediction, residual, estimate and preview as blocks come."""
+"""Run a model beside the stage: prediction, residual, estimate and preview of each block."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
-#: how long a problem of the stream stays in the status [s], and how many of them
+#: time for which a problem of the stream stays in the status [s], and most problems there
 REMEMBER, MOST = 5.0, 4
-#: share of the predictions of a second that must meet a displacement, and for how many seconds
-#: they may miss it: the first one began somewhere inside
+#: share of the predictions of a second that must meet a displacement, and number of seconds that
+#: may fall short: the first second of a stream is incomplete
 MET, PATIENCE = 0.5, 1
 
 
 class ModelNode(LabNode):
-    """Predicts what the stage does, and says when it does something else."""
+    """Predicts the displacement, and warns when the stage moves differently."""
 
     executable = 'model'
 
@@ -48,7 +48,7 @@ class ModelNode(LabNode):
         self._error = LiveError(self.values['window'])
         values = [self.values[n] for n in ('horizon', 'observe_gain', 'preview_rate', 'adapt')]
         self._corrector, self._estimates = Corrector(*values), Matcher()
-        # of the estimate
+        # error of the estimate
         self._left = LiveError(self.values['window'])
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
         self._problems: dict[str, float] = {}
@@ -78,7 +78,7 @@ class ModelNode(LabNode):
     # models
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse a model file that is not there; what is wrong inside is in ``~/status``."""
+        """Refuse a missing model file; ``~/status`` reports faults inside a file."""
         return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -107,7 +107,7 @@ class ModelNode(LabNode):
         self._source, self._refusal = source, ''
         self._models += 1
         if self._models > 1:
-            # the state stays what it was
+            # the state stays the same, so the status writes no line
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
         self._forget_errors()
 
@@ -141,7 +141,7 @@ class ModelNode(LabNode):
         predictor.problem, known = '', predictor.memory_known
         prediction = predictor.process(samples)
         if self._is_lost:
-            # what was found before says nothing of now
+            # the earlier error says nothing about the present
             self._error.clear()
         if prediction is not None:
             self._prediction.publish(to_message(prediction))
@@ -216,7 +216,7 @@ class ModelNode(LabNode):
             message = JointState()
             message.header.stamp = self.get_clock().now().to_msg()
             for quantity in QUANTITIES:
-                # a quantity that does not come leaves a hole in the plot, not a zero
+                # a missing quantity is NaN, which leaves a gap in the plot
                 values = b.values.get(quantity, (float('nan'),) * 3)
                 message.name += [f'{quantity}/{what}' for what in ('mean', 'min', 'max')]
                 message.position.extend(values)
@@ -225,13 +225,13 @@ class ModelNode(LabNode):
     # status and diagnostics
 
     def _note_problem(self, problem: str) -> None:
-        # a status that comes too fast is overwritten on its way: each tells the last few problems
+        # a listener may miss a status, so each status names the last few problems
         self._problems.pop(problem, None)
         self._problems[problem] = time.monotonic()
         self._report_state()
 
     def _verdict(self) -> tuple[str, str]:
-        """Return why to identify the stage again, or else what is corrected; both may be empty."""
+        """Return a reason to identify again, or else the corrections; both may be empty."""
         model, ratio = self._predictor.model, self.values['warn_ratio']
         if model is None or self._left.seconds < 0.5 * self._left.window:
             return '', ''
@@ -253,11 +253,11 @@ class ModelNode(LabNode):
         return f'{n} wild readings of displacement are left out of the live error' if n else ''
 
     def _mismatch(self) -> str:
-        """Return why predictions cannot be judged, empty when they can; once a second."""
+        """Return why predictions cannot be compared, or ''; called once a second."""
         predicted, measured, compared = self._predicted, self._measured, self._compared
         self._predicted = self._measured = self._compared = 0
         if self._count and not predicted:
-            # displacement is not to blame
+            # the voltage is at fault, not the displacement
             self._forget_errors()
             return self._predictor.problem
         self._unmet = self._unmet + 1 if compared < MET * predicted else 0
@@ -291,7 +291,7 @@ class ModelNode(LabNode):
         self.report_status(state, 0.0, text, level, brief=brief, problems=wrong, **values)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return how the prediction goes."""
+        """Return counts, errors and problems of the prediction."""
         self._report_state()
         now, p = time.monotonic(), self._predictor
         elapsed, mismatch = max(now - self._count_at, 1e-3), self._mismatch()
@@ -337,11 +337,11 @@ class ModelNode(LabNode):
         return WARN if message else OK, told, values
 
     def close(self) -> None:
-        """Wake nobody any more."""
+        """Stop the loader."""
         self._loader.close()
 
 
 def _tried(model: StageModel) -> StageModel:
-    """Return the model after a few samples, so that all it needs is compiled and fits together."""
+    """Run a few samples, which compiles the kernels of a model and finds its faults."""
     model.stream().process(np.full(10, model.scaling.range[0]))
     return model

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models that a node gets when it starts, and while it works: then a thread reads the newest."""
+"""Load the models of a node, at its start and, in a thread, while it works."""
 
 from __future__ import annotations
 
@@ -23,26 +23,27 @@ T = TypeVar('T')
 
 
 def no_file(path: str) -> str | None:
-    """Return that there is no such file of a model, None when there is or none is named."""
+    """Return the problem if a named model file is missing, else None."""
     return f'model: {path}: no such file' if path and not Path(path).is_file() else None
 
 
 class ModelLoader(Generic[T]):
     """
-    Reads models, those of the topic `model` too.
+    Reads models from files and from the topic `model`.
 
-    It does so in a thread, for reading YAML and compiling take longer than a block.
+    A thread reads them, because reading YAML and compiling take longer than a block.  The thread
+    skips models that a newer one has overtaken.
 
     Parameters
     ----------
     node : Node
     prepare : callable
-        Makes of a model what the node needs; called by the thread.
+        Prepares a model for the node; the thread calls it.
     take : callable
-        Gets that and where the model is from, or None and why there is none; called by the
-        executor of the node, one after the other.
+        Gets the prepared model and its source, or None and an error.  The executor of the node
+        calls it for each model in turn.
     done : callable
-        Called after all of them.
+        Called after `take` for all loaded models.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class ModelLoader(Generic[T]):
 
     def begin_with(self, path: str) -> None:
         """
-        Load a file at once: when a node starts, nothing waits, and a bad file ends it.
+        Load a file at once, at the start of a node; a bad file ends the node.
 
         Raises
         ------
@@ -79,14 +80,14 @@ class ModelLoader(Generic[T]):
         self.load(path, lambda: load(path))
 
     def load(self, source: str, read: Callable[[], StageModel]) -> None:
-        """Load what a function returns."""
+        """Load the model that a function returns."""
         self._wishes.put((source, read))
         if self._thread is None:
             self._thread = threading.Thread(target=self._load_all, name='load', daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Wake nobody any more."""
+        """Stop waking the executor."""
         self._is_ending = True
 
     def _load_text(self, message: String) -> None:
@@ -103,7 +104,7 @@ class ModelLoader(Generic[T]):
                     self._loaded.put((self._prepare(read()), source))
             except PiezoIdentError as error:
                 self._loaded.put((None, ' '.join(str(error).split())))
-            # a file or text from outside must not end the node, whatever is in it
+            # no content of a file or text may end the node
             except Exception as error:  # noqa: BLE001
                 self._loaded.put((None, f'{source}: {type(error).__name__}: {error}'))
             if self._is_ending:

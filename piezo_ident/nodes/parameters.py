@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Every parameter of every node, in one place: value, unit, range, and what it means.
+Declare every parameter of every node: default, unit, range and meaning.
 
-The nodes declare them from here, the tables of the documentation are made from here, and the
-YAML files in ``config/`` are tested against here.
+The nodes take their parameters from here, and the tables of the documentation are made from here.
+Tests compare the YAML files in ``config/`` with these declarations.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from piezo_ident.model.observer import HORIZON
 
-#: topics of blocks of samples, and of texts that a node that comes late must still hear
+#: topics of blocks of samples, and topics of texts that a late node must still receive
 SAMPLE_TOPICS = (
     'voltage',
     'displacement',
@@ -31,21 +31,21 @@ LATCHED_TOPICS = ('model', 'report')
 @dataclass(frozen=True)
 class Declaration:
     """
-    One parameter.
+    Declaration of one parameter.
 
     Attributes
     ----------
     name : str
     default : bool, int, float, str or tuple of str
-        Its type is the parameter's type.
+        The parameter has the type of its default.
     description : str
-        Without the unit.
+        Meaning, without the unit.
     unit : str
-        Empty when there is none.
+        Empty without a unit.
     low, high : float, optional
         Range of a number, both ends included.
     choices : tuple of str
-        What a text may be; anything when empty.
+        Allowed texts; any text if empty.
     read_only : bool
         Whether it can only be set when the node starts.
     """

@@ -35,9 +35,9 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     """
     Predict a record in free run, and compare it with the measured displacement.
 
-    A record that starts above the lowest voltage has an unknown memory, which is estimated from
-    its early part.  A model with creep also gets the creep from earlier motion if the early part
-    shows it.  Later samples are predicted without any fit.
+    A record that does not start at rest at the lowest voltage has an unknown memory, which is
+    estimated from its early part.  A model with creep also gets the creep from earlier motion if
+    the early part shows it.  Later samples are predicted without any fit.
 
     Parameters
     ----------
