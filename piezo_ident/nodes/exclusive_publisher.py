@@ -175,7 +175,7 @@ class ExclusivePublisher:
         self._publisher.publish(to_message(samples))
 
     def others(self) -> list[str]:
-        """Return the nodes of the other publishers, without the own name, which a killed node keeps."""
+        """Return the nodes of the other publishers, without those of the own name."""
         own = self._node.get_fully_qualified_name()
         return sorted(set(publishers(self._node, self.topic).values()) - {own})
 
@@ -186,7 +186,7 @@ class ExclusivePublisher:
         return min((name for name in new if name != UNNAMED), default='')
 
     def stop_listening(self) -> None:
-        """Drop the listener, which costs time with each block, between two turns of the executor."""
+        """Drop the listener, which gets every own block, between two turns of the executor."""
         with self._lock:
             listener, self._listener = self._listener, None
         if listener is not None:

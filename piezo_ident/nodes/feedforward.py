@@ -7,8 +7,8 @@ Feedforward node: makes the voltage that moves the stage along `reference`.
 ``~/start`` takes the right to drive.  The node then answers each block of `reference` by a block
 of `voltage`.  The voltage has its own clock from zero, and belongs to the reference `preview`
 seconds before.  The node joins the reference from rest along a raised cosine.  When the reference
-is silent for `silence`, the node plays its rest and ramps to rest.  ``~/stop``, SIGINT and SIGTERM
-ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
+is silent for `silence`, the node plays its remaining part and ramps to rest.  ``~/stop``, SIGINT
+and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
 
 ``~/learn`` repeats the last reference, corrects the voltage by the measured error, and ends when
 the error stops falling.  A further call goes on from the best repetition.

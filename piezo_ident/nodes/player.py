@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The player node: replays a bag onto topics with the original spacing, or a multiple of it.
+Player node: replays a bag onto topics with the recorded spacing, or a multiple of it.
 
-Blocks carry their own times, so the samples that are replayed are the samples that were measured,
-bit by bit, at whatever rate.  Order and spacing are those of the log times, on a schedule that is
-counted from its start.  Where the clock of these was set back, the order is that of the file, as
-in a record that is read from the bag.  Only the measured topics are replayed unless `topics` says
-otherwise.
+Blocks carry their own times, so the replayed samples equal the recorded samples bit by bit at any
+rate.  The log times give order and spacing, on a schedule that counts from its start.  If the
+clock of the log times was set back, the order of the file is kept, as in a record that is read
+from the bag.  The player replays the measured topics unless `topics` names others.
 
-Nothing is sent before every topic has met as many subscribers as `subscribers` says.  After that
-nobody is waited for; each listener reports what it lost.
+The player sends once every topic has as many subscribers as `subscribers` says.  From then on it
+waits for no listener; each listener reports its losses.
 """
 
 from __future__ import annotations
@@ -43,11 +42,11 @@ from piezo_ident.record.blocks import Samples
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
-#: how long the end of the node waits for the replay to end [s]
+#: longest wait for the end of a replay when the node ends [s]
 PATIENCE = 1.0
-#: between the match of the subscribers and the first message, for them to know of it too [s]
+#: time between the match of the subscribers and the first message, so that both sides know it [s]
 SETTLE = 0.2
-#: how often progress is reported [s]
+#: time between two reports of progress [s]
 REPORT_EVERY = 0.25
 
 
@@ -57,7 +56,7 @@ class _Stopped(Exception):
 
 @dataclass(eq=False)
 class Replay:
-    """One replay on its way, as both threads see it."""
+    """State of a replay, shared by both threads."""
 
     bag: str
     topics: tuple[str, ...]
@@ -87,7 +86,7 @@ class PlayerNode(LabNode):
             self.start()
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse names that cannot be."""
+        """Refuse invalid names of topics."""
         return topics_problem(value) if name == 'topics' else None
 
     # services
@@ -99,7 +98,7 @@ class PlayerNode(LabNode):
         Raises
         ------
         PiezoIdentError
-            When no bag is named, there is none, or one is being replayed.
+            When the bag is missing, or a replay runs already.
         """
         bag = self.values['bag']
         if not bag:
@@ -109,7 +108,7 @@ class PlayerNode(LabNode):
         if self._is_replaying():
             raise PiezoIdentError('replaying already; call stop, and wait until it has ended')
         self._replay = Replay(bag, tuple(self.values['topics']))
-        # a daemon: while a large bag is looked through nothing is lost by an end
+        # a daemon thread: ending it while it searches a large bag loses nothing
         self._thread = threading.Thread(
             target=self._work, args=(self._replay,), name='replay', daemon=True
         )
@@ -140,7 +139,7 @@ class PlayerNode(LabNode):
             self._thread.join(PATIENCE)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return how fast it goes."""
+        """Return counts, rate and problems of the replay."""
         replay = self._replay
         rate = self._rate.of(replay.messages if replay else 0)
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
@@ -171,19 +170,19 @@ class PlayerNode(LabNode):
                 f'stopped after {replay.messages} of {replay.total} messages',
                 progress=replay.progress,
             )
-        # nobody else hears of a thread that ends by itself
+        # the status has to report any failure of this thread
         except Exception as error:  # noqa: BLE001
             replay.failure = self.reason(error)
             state = 'failed' if prepared else 'refused'
             self._report(state, replay.failure, ERROR, replay.progress)
 
     def _looked_through(self, replay: Replay, bag: Bag) -> tuple[int, dict[str, str]]:
-        """Return how many of the chosen blocks go back, and the topics that are chosen."""
+        """Count the steps back of the chosen blocks; return the count and the chosen topics."""
         chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
         carried = {t: t for t in chosen if t in _carried(bag)}
 
         def blocks() -> Iterator[tuple[str, Samples]]:
-            # what is no block is replayed as it is
+            # messages without a block are replayed unchanged
             with suppress(DataError):
                 for topic, samples, _ in blocks_in(bag, carried):
                     if replay.stop.is_set():
@@ -206,7 +205,7 @@ class PlayerNode(LabNode):
                     profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
                     profile.depth,
                 )
-                # kept from one replay to the next: its subscribers are met already
+                # publishers are kept for the next replay, as they have met their subscribers
                 if key not in self._senders:
                     kind = message_class(connection.msgtype)
                     self._senders[key] = self.create_publisher(kind, target, profile)
@@ -222,7 +221,7 @@ class PlayerNode(LabNode):
         Raises
         ------
         PiezoIdentError
-            When they do not come.
+            When too few come within `wait_limit`.
         """
         need, limit = self.values['subscribers'], self.values['wait_limit']
         began = time.monotonic()
@@ -252,12 +251,12 @@ class PlayerNode(LabNode):
             stamp = clock.rising(connection.topic, logged)
             now, rate = time.monotonic(), self.values['rate']
             if schedule is None:
-                # what is caught up with at once must fit into the queues of the readers
+                # messages that are sent late all at once must fit into the queues of the readers
                 schedule, first = Schedule(rate, now, SLIP / max(1.0, rate)), stamp
             position = (stamp - first) * 1e-9
             if rate != schedule.speed:
                 schedule.change_speed(rate, position, now)
-            # in short waits: a pause in the recording delays neither a stop nor the status
+            # short waits, so that stop and status stay prompt during a pause in the recording
             while True:
                 if now - reported > REPORT_EVERY:
                     reported = now
@@ -310,10 +309,11 @@ def chosen_topics(
     bag: Bag, wanted: Sequence[str], resolve: Callable[[str], str]
 ) -> dict[str, str]:
     """
-    Return under which name each chosen topic of a bag is replayed.
+    Choose topics of a bag, and the name under which each is replayed.
 
-    A topic is found by its full name here, else by the end of its name, so that what was recorded
-    in one namespace can be replayed in another, else by the quantity that its blocks carry.
+    A topic is found by its full name here.  Otherwise it is found by the end of its name, so that
+    a recording of one namespace can be replayed in another.  Otherwise it is found by the quantity
+    that its blocks carry.
 
     Parameters
     ----------
@@ -363,15 +363,15 @@ def _carried(bag: Bag) -> dict[str, str]:
     try:
         return carried_quantities(bag)
     except DataError:
-        return {}  # no samples in it: then by name alone
+        return {}  # a bag without samples: topics are found by name alone
 
 
 def _profile(connection: Connection) -> QoSProfile:
-    """Return the QoS with which a topic was recorded; that of the graph where it is unknown."""
+    """Return the recorded QoS of a topic, or the QoS of the graph if it is unknown."""
     offered = getattr(connection.ext, 'offered_qos_profiles', None) or []
     reliable = all(o.reliability != QosReliability.BEST_EFFORT for o in offered)
     latched = bool(offered) and all(o.durability == QosDurability.TRANSIENT_LOCAL for o in offered)
     known = [o.depth for o in offered if o.history == QosHistory.KEEP_LAST and o.depth > 0]
-    # a replay may be faster than the recording was, so it keeps as many as its readers do
+    # a replay may be faster than the recording, so it queues as many messages as its readers
     least = LATCHED.depth if latched else STREAM.depth
     return qos_of(reliable=reliable, latched=latched, depth=max([least, *known]))

@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The recorder node: writes topics to a bag as they pass, their serialised bytes untouched.
+Recorder node: writes the serialised messages of topics to a bag, byte by byte.
 
-The subscriptions are not spun by the executor, which would take 0.3 ms a message: a thread empties
-them some fifty times a second and does all the writing.  The log time of a message is when the
-middleware received it, so neither the thread nor the disk moves it.
+The executor would take 0.3 ms for each message.  The subscriptions therefore bypass it: a thread
+empties them some fifty times a second and writes the bag.  The log time of a message is the time
+at which the middleware received it, independent of thread and disk.
 
-Topics of the graph are subscribed to before they have a publisher; any other as soon as it has
-one, which tells its type.  A subscription asks for what all publishers of its topic offer.
+The recorder subscribes to the topics of the graph before they have a publisher.  It subscribes to
+any other topic once it has a publisher, which tells the type.  A subscription requests the QoS
+that all publishers of its topic offer.
 
-With `max_bag_size` a long recording is cut into parts, each a bag of its own; the subscriptions
-keep what comes while one is closed and the next one made.
+`max_bag_size` cuts a long recording into parts, each a bag of its own.  The subscriptions keep the
+messages that arrive between two parts.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
 
-#: how often the subscriptions are emptied [s]
+#: time between two emptyings of the subscriptions [s]
 POLL = 0.02
-#: how often publishers are looked for [s]
+#: time between two searches for publishers [s]
 LOOK = 0.1
-#: how long a bag may take to be closed before the node ends anyway, as ros2 launch has it [s]
+#: longest time for closing a bag before the node ends anyway; ros2 launch waits 5 s [s]
 END = 4.0
-#: how long the subscriptions may take to meet the publishers that are there [s]
+#: longest time for matching subscriptions with the existing publishers [s]
 MATCH_LIMIT = 2.0
 
 
 @dataclass(eq=False)
 class Recording:
-    """One bag on its way, as both threads see it."""
+    """State of a recording, shared by both threads."""
 
     output: str
     started: float = field(default_factory=time.monotonic)
@@ -74,7 +75,7 @@ class RecorderNode(LabNode):
             self.start()
 
     def refuse(self, name: str, value: Any) -> str | None:
-        """Refuse names that cannot be."""
+        """Refuse invalid names of topics and folders."""
         if name == 'output':
             if not value.strip():
                 return 'output must name a folder'
@@ -92,7 +93,7 @@ class RecorderNode(LabNode):
         Raises
         ------
         PiezoIdentError
-            When a recording is on its way.
+            When a recording runs already.
         """
         if self._is_recording():
             raise PiezoIdentError('recording already; call stop, and wait until it is done')
@@ -129,7 +130,7 @@ class RecorderNode(LabNode):
             self._thread.join(END)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return what the recording takes in."""
+        """Return counts, rate and problems of the recording."""
         recording = self._recording
         rate = self._rate.of(recording.messages if recording else 0)
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
@@ -143,7 +144,7 @@ class RecorderNode(LabNode):
     # subscriptions, in the executor's thread
 
     def _look(self) -> None:
-        """Follow the publishers while a recording is on its way."""
+        """Follow the publishers during a recording."""
         recording, subscriptions = self._recording, self._inputs
         if recording is None or subscriptions is None or recording.end.is_set():
             return
@@ -165,7 +166,7 @@ class RecorderNode(LabNode):
                 },
                 self.values['max_bag_size'],
             )
-        # nobody would hear of a thread that ends by itself
+        # the status has to report any failure of this thread
         except Exception as error:  # noqa: BLE001
             self._end(recording, subscriptions, self.reason(error))
             return
@@ -201,7 +202,7 @@ class RecorderNode(LabNode):
         flushed = time.monotonic()
         last = reported = False
         while not last:
-            # once more after the end was asked for: what has arrived by then is kept
+            # one more round after the stop keeps the messages that have arrived by then
             last = recording.end.wait(POLL)
             for stamp, topic, raw in subscriptions.arrived():
                 if topic not in writer:
@@ -209,7 +210,7 @@ class RecorderNode(LabNode):
                 writer.write(topic, stamp, raw)
             recording.messages = writer.messages
             now = time.monotonic()
-            # the next chance comes a poll later, and writing takes its time too
+            # early by two polls: the next round comes a poll later, and writing takes time, too
             due = now - flushed > self.values['flush'] - 2 * POLL
             if due:
                 writer.flush()

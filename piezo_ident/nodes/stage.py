@@ -2,25 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The stage node: a simulated stage, sample-exact whatever the block size.
+Stage node: simulates a stage sample by sample, at any block size.
 
-Each block of `voltage` passes the guard (`piezo_ident.live.guard`), drives the stage, and comes
-back as `displacement` with the same t and segment; `applied_voltage` is what the guard made of the
-command, before the converter rounds it.  Where the two differ the guard had reason to: the
-displacement is published all the same, so that nothing is lost.
+Each block of `voltage` passes the guard (`piezo_ident.live.guard`) and drives the stage.  The node
+answers by a block of `displacement` with the same t and segment.  `applied_voltage` is the voltage
+after the guard, before the converter rounds it.  The node publishes the displacement also if the
+guard has altered the command, so that nothing is lost.
 
-A stage of two axes has topics of its own for the second, as `voltage_b`, `displacement_b` and
-`applied_voltage_b`, and a guard.  The stream of the first axis rules: a block of `voltage` waits
-up to `PATIENCE` for that of `voltage_b` with the same t.  What does not come in time leaves the
-last voltage of that axis in force; a second axis that nobody drives stays at rest.
+A stage of two axes has own topics for the second axis, such as `voltage_b`, `displacement_b` and
+`applied_voltage_b`, and a guard of its own.  The stream of the first axis rules: a block of
+`voltage` waits up to `PATIENCE` for the block of `voltage_b` with the same t.  A block that does
+not come in time leaves the last voltage of that axis in force.  A second axis without a publisher
+stays at rest.
 
-The stage itself never starts over: as a real one it keeps its memory from stream to stream, and
-its own clock (of drift and hum) goes on.
+The stage never starts over.  Like a real stage it keeps its memory from stream to stream, and its
+own clock (for drift and hum) goes on.
 
 | in the stream | what the stage does | status |
 |---|---|---|
-| layout of no block, stamps off the clock | the block is refused; its ticks become a gap | WARN |
-| a sample that is no number | the last command stays in force for it | WARN |
+| wrong layout, stamps off the clock | the block is refused; its ticks become a gap | WARN |
+| a sample that is NaN or infinite | the last command stays in force for it | WARN |
 | outside the limits, faster than the slew | at the limit; followed at the slew | WARN |
 | a block that came before | ignored: no displacement, the stage does not move | WARN |
 | a gap up to `silence`, and 10 s | the stage holds its voltage for as many ticks, reported on \
@@ -38,11 +39,10 @@ going on; what comes next is a new stream | WARN, unless it was at rest |
 | a second publisher | its blocks are refused until the stream of the first has ended: silent, \
 and its publisher gone or the stage at rest | WARN |
 
-`piezo_ident.live.sample_clock` tells how publishers are distinguished.  Beside a second publisher
-a loss of blocks ends the stream, since the block behind the loss could be anybody's.
+`piezo_ident.live.sample_clock` tells how publishers are distinguished.  A loss of blocks beside a
+second publisher ends the stream, because either publisher may have sent the block after the loss.
 
-SIGINT and SIGTERM ramp to rest within a second, steeper than `ramp_slew` where that would take
-longer.
+SIGINT and SIGTERM ramp to rest within a second, if necessary steeper than `ramp_slew`.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ from std_msgs.msg import Float64MultiArray
 
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
-#: how long a block waits for that of a further axis [s]
+#: longest wait of a block for the block of a further axis [s]
 PATIENCE = 0.2
-#: longest gap through which a voltage is held [s]
+#: longest gap in which the voltage is held [s]
 LONGEST_GAP = 10.0
 
 _WHY = {
@@ -97,13 +97,13 @@ class StageNode(LabNode):
             raise DataError(f'stage: {error}') from None
         seed = self._stage.seed if self.values['seed'] < 0 else self.values['seed']
         self.sample_rate = self._stage.sample_rate
-        # behind the names of what belongs to an axis
+        # the topic of an axis ends with the tail of the axis
         self._tails = [f'_{name}' if name else '' for name in self._stage.axes]
         self._axis_guards = [Guard(self._settings()) for _ in self._tails]
         self._warm_up()
         self._run = self._stage.run(np.random.default_rng(seed))
         self._sample_clock = SampleClock(self.sample_rate, self._longest_gap())
-        # tick of the next sample applied, whatever it comes from
+        # tick of the next applied sample, from a command, a gap or a ramp
         self._tick = 0
         self._segment = ''
         self._faults = RecentFaults()
@@ -116,7 +116,7 @@ class StageNode(LabNode):
             [self.create_publisher(Float64MultiArray, f'{q}{x}', STREAM) for x in self._tails]
             for q in ('displacement', 'applied_voltage')
         )
-        # blocks of the first axis that wait for those of the others, and since when
+        # blocks of the first axis that wait for the other axes, each with its arrival
         self._waiting: deque[tuple[Samples, int | None, float]] = deque()
         self._companions = {tail: Companion(self.sample_rate) for tail in self._tails[1:]}
         self._further = {
@@ -135,7 +135,7 @@ class StageNode(LabNode):
         self._ramp_timer = self.create_timer(RAMP_PERIOD, self._on_ramp, autostart=False)
 
     def _warm_up(self) -> None:
-        """Compile what the first block would otherwise wait for."""
+        """Compile the kernels, so that the first block need not wait."""
         run, guard = (
             self._stage.run(np.random.default_rng(0)),
             Guard(self._axis_guards[0].settings),
@@ -145,7 +145,7 @@ class StageNode(LabNode):
             run.process(self._command([guard.process(v).voltage] * len(self._tails)))
 
     def _command(self, voltages: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return what the stage takes: a vector for one axis, a matrix for several."""
+        """Stack voltages for the stage: a vector for one axis, a matrix for several."""
         return voltages[0] if len(voltages) == 1 else np.column_stack(voltages)
 
     @property
@@ -164,7 +164,7 @@ class StageNode(LabNode):
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
-        """Take new limits and times over at the next sample."""
+        """Apply new limits and times from the next sample on."""
         for guard in self._axis_guards:
             guard.settings = self._settings()
         self._sample_clock.longest_gap = self._longest_gap()
@@ -202,7 +202,7 @@ class StageNode(LabNode):
         self._take_complete()
 
     def _take_complete(self) -> None:
-        """Take the blocks whose further voltages are there, or do not come."""
+        """Process the blocks whose further voltages have come or are overdue."""
         while self._waiting:
             samples, sequence, since = self._waiting[0]
             lacking = any(
@@ -249,7 +249,7 @@ class StageNode(LabNode):
     def _guarded(
         self, tail: str, guard: Guard, samples: Samples, restarted: bool
     ) -> NDArray[np.float64]:
-        """Return what is applied to an axis."""
+        """Pass the command of an axis through its guard; return the applied voltage."""
         command = samples.values
         if tail:
             command = self._companions[tail].take(samples.t)
@@ -270,7 +270,7 @@ class StageNode(LabNode):
             publisher.publish(to_message(Samples(t, v, segment, f'voltage{tail}')))
 
     def _move(self, voltages: Sequence[NDArray[np.float64]], segment: str) -> None:
-        """Apply what nobody commanded, and report it as applied."""
+        """Apply a voltage that was not commanded, and publish it as applied."""
         self._run.process(self._command(voltages))
         for start in range(0, voltages[0].size, BLOCK_SIZE):
             cut = [v[start : start + BLOCK_SIZE] for v in voltages]
@@ -329,7 +329,7 @@ class StageNode(LabNode):
         self.report_status(self._state, 0.0, text, level, problems=faults, segment=self._segment)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return rate, what was lost, altered and refused, and head-room."""
+        """Return rate, counts of lost, altered and refused samples or blocks, and head-room."""
         samples = self._counts['samples']
         rate, worked = self._rate.of(samples), self._work_rate.of(self._busy)
         faults = self._faults.text
@@ -361,7 +361,7 @@ class StageNode(LabNode):
     def close(self) -> None:
         """Ramp to rest within a second."""
         size = max(1, round(RAMP_PERIOD * self.sample_rate))
-        # a ramp that is under way at its own pace gives way to one that ends in time
+        # replaces a slow ramp by a ramp that ends in time
         guards = [Guard(guard.settings, guard.applied) for guard in self._axis_guards]
         begin, sent = time.monotonic(), 0
         while not all(guard.is_at_rest for guard in guards):

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Subscriptions that are emptied now and then, instead of message by message.
+Empty subscriptions now and then, without the executor.
 
-The executor takes 0.3 ms to hand over one message; a node that only collects blocks gets them for
-a fifth of that.
+The executor takes 0.3 ms to hand over one message.  A node that only collects blocks takes them
+itself in a fifth of this time.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from std_msgs.msg import Float64MultiArray
 
 
 class _NotSpun(CallbackGroup):
-    """Keeps subscriptions away from the executor."""
+    """Callback group that keeps subscriptions away from the executor."""
 
     def can_execute(self, entity: Any) -> bool:
         return False
@@ -49,15 +49,15 @@ class _NotSpun(CallbackGroup):
 
 def between_turns(node: Node, work: Callable[[], None]) -> None:
     """
-    Call something between two turns of the executor of a node; from any thread.
+    Call a function between two turns of the executor of a node; any thread may call this.
 
-    An entity that is destroyed while the executor gathers what to wait for breaks the executor.
+    Destroying an entity while the executor gathers its wait set breaks the executor.
 
     Parameters
     ----------
     node : Node
     work : callable
-        Called at once where nobody spins the node.
+        Called at once if the node has no executor.
     """
     if node.executor is None:
         work()
@@ -67,7 +67,7 @@ def between_turns(node: Node, work: Callable[[], None]) -> None:
 
 def message_class(name: str) -> Any:
     """
-    Return the class of a message type like ``std_msgs/msg/String``.
+    Import the class of a message type like ``std_msgs/msg/String``.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def message_class(name: str) -> Any:
 
 
 def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | None:
-    """Return why these cannot be names of topics, None when they can."""
+    """Return the problem if names of topics are invalid, else None."""
     if not names:
         return f'{parameter} must name at least one'
     for name in names:
@@ -97,7 +97,7 @@ def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | Non
 def qos_of(
     *, reliable: bool = True, latched: bool = False, depth: int = STREAM.depth
 ) -> QoSProfile:
-    """Return a QoS that keeps the last messages."""
+    """Make a QoS that keeps the last messages."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
@@ -109,20 +109,20 @@ def qos_of(
 def unspun(
     node: Node, kind: Any, topic: str, profile: QoSProfile | None = None, *, raw: bool = False
 ) -> Subscription:
-    """Return a subscription that the executor leaves alone: its owner takes the messages."""
+    """Subscribe without the executor: the caller takes the messages."""
     group, profile = _NotSpun(), profile or qos_of()
     return node.create_subscription(kind, topic, _ignore, profile, callback_group=group, raw=raw)
 
 
 class BlockSubscriptions:
     """
-    Topics of blocks that are collected.
+    Subscriptions to topics of blocks, which are collected.
 
     Parameters
     ----------
     node : Node
     take : callable
-        Gets topic, the key under which it was added, message, and the middleware's information.
+        Gets topic, the key under which it was added, message, and information of the middleware.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class BlockSubscriptions:
 
     @property
     def unpublished(self) -> list[str]:
-        """Keys of the topics to which nobody publishes."""
+        """Keys of the topics without a publisher."""
         return [
             key or topic
             for topic, (key, subscription) in self._subscriptions.items()
@@ -145,7 +145,7 @@ class BlockSubscriptions:
         ]
 
     def drain(self) -> None:
-        """Hand over all that has come."""
+        """Hand over all messages that have come."""
         for topic, (key, subscription) in self._subscriptions.items():
             # no more at once than it keeps, or a flood on one topic starves the others
             for _ in range(STREAM.depth):
@@ -157,7 +157,7 @@ class BlockSubscriptions:
 
 @dataclass(frozen=True)
 class _Request:
-    """What is asked of the publishers of a topic."""
+    """Requested type and QoS of a topic."""
 
     type: str
     reliable: bool
@@ -177,19 +177,19 @@ class _Topic:
     losses: LossCount = field(default_factory=LossCount)
     taken: int = 0
     problem: str = ''
-    #: who publishes, and whether it was one and the same at the last two looks
+    #: publishers, and whether the last two looks found the same single publisher
     publishers: frozenset[bytes] = frozenset()
     is_single: bool = False
     #: whether the last message came from the only publisher since
     is_followed: bool = False
 
     def note(self, number: int) -> None:
-        """Take note of the number that the publisher gave a message."""
+        """Note the number that the publisher gave a message."""
         if self.subscription.msg_type is Float64MultiArray:
             self.losses.note(number, alone=self.is_followed)
-        # a latched message may be replaced on its way
+        # a latched message may be replaced before it arrives, so its numbers may have gaps
         elif self.request is not None and not self.request.latched:
-            # of several that publish by right, as on /diagnostics, the numbers say nothing
+            # the numbers of several legitimate publishers, as on /diagnostics, say nothing
             if not self.is_followed:
                 self.losses.restart()
             self.losses.note(number, alone=True)
@@ -197,7 +197,7 @@ class _Topic:
 
 class RawSubscriptions:
     """
-    The subscriptions of a recording: serialised messages, with the QoS that publishers offer.
+    Subscriptions of a recording: serialised messages, with the QoS that publishers offer.
 
     Parameters
     ----------
@@ -215,12 +215,12 @@ class RawSubscriptions:
 
     @property
     def lost(self) -> int:
-        """Messages that were sent and not received."""
+        """Number of messages that were sent and not received."""
         return sum(topic.losses.lost for topic in self._topics.values())
 
     @property
     def problems(self) -> str:
-        """Why a topic is not recorded, and a clock that was set; empty when all is well."""
+        """Unrecorded topics with their reasons, and a clock that was set; '' without problems."""
         problems = [topic.problem for topic in self._topics.values() if topic.problem]
         if self._clock.set_by:
             moved = f'the clock of this machine was set by {self._clock.set_by * 1e-9:+.3g} s'
@@ -228,7 +228,7 @@ class RawSubscriptions:
         return '; '.join(problems)
 
     def look(self) -> bool:
-        """Subscribe to new topics; return whether all publishers that are there are matched."""
+        """Subscribe to new topics; return whether all existing publishers are matched."""
         matched = True
         for topic in self._topics.values():
             request = self._request(topic)
@@ -239,7 +239,7 @@ class RawSubscriptions:
         return matched
 
     def close(self) -> None:
-        """Take back all subscriptions; from any thread."""
+        """Destroy all subscriptions; any thread may call this."""
         self._closed = True
         between_turns(self._node, self._destroy_all)
 
@@ -249,8 +249,8 @@ class RawSubscriptions:
                 self._destroy(topic)
 
     def _request(self, topic: _Topic) -> _Request | None:
-        """Return what to ask for: what all publishers offer, or what the graph agrees on."""
-        # an endpoint without a type is not known in full yet
+        """Choose type and QoS: as all publishers offer, or else as the graph agrees on."""
+        # discovery of an endpoint is incomplete until its type is known
         infos = [
             i for i in self._node.get_publishers_info_by_topic(topic.name) if '/' in i.topic_type
         ]
@@ -299,7 +299,7 @@ class RawSubscriptions:
             self._node.destroy_subscription(subscription)
 
     def arrived(self) -> list[tuple[int, str, bytes]]:
-        """Return log time, topic and bytes of what has arrived, in the order of arrival."""
+        """Take all messages; return their log times, topics and bytes in order of log time."""
         messages = []
         self._clock.look()
         with self._lock:
@@ -323,7 +323,7 @@ class RawSubscriptions:
         return messages
 
     def offers(self, name: str) -> tuple[str, list[Qos]]:
-        """Return the type of a topic, and what its publishers offer or were asked for."""
+        """Return the type of a topic, and the offered QoS profiles, or else the requested one."""
         request = self._topics[name].request
         if request is None:
             return '', []
@@ -333,14 +333,14 @@ class RawSubscriptions:
 
 
 def _ignore(_: object) -> None:
-    """Do nothing: the messages are taken by `drain` or `arrived`."""
+    """Do nothing: `drain` or `arrived` take the messages."""
 
 
 def _offer(profile: QoSProfile) -> Qos:
-    """Return a profile as it stands in a bag."""
+    """Convert a QoS profile to its form in a bag."""
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return SAMPLE_QOS._replace(
-        # discovery carries no history, so it says what the graph agrees on
+        # discovery does not tell the depth, so the agreed depth of the graph is written
         depth=LATCHED.depth if latched else STREAM.depth,
         reliability=QosReliability(int(profile.reliability)),
         durability=QosDurability(int(profile.durability)),

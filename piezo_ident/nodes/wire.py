@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Between messages and blocks of samples: `piezo_ident.record.blocks` on std_msgs, and the QoS."""
+"""Convert blocks of samples to std_msgs and back, and define the QoS of the topics."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
-#: most samples of a block, and characters of a label
+#: most samples of a block, and most characters of a label
 MOST, LONGEST = 100_000, 200
-#: a node that the middleware has not told of yet
+#: name for a node that the middleware has not discovered yet
 UNNAMED = 'a node without a name'
 
-#: samples: reliable, the last five seconds of blocks, on both sides: a reader that gets no time
-#: from the machine meanwhile misses none
+#: samples: reliable, with the last five seconds of blocks on both sides, so that a reader that is
+#: stopped for a while loses no block
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
-#: what a node that comes late must still hear: model, report, status
+#: messages that a late node must still receive: model, report, status
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-#: what people look at, and diagnostics
+#: messages for people, and diagnostics
 PREVIEW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
 #: services: responses go to all clients; with the default depth of 10 a slow client loses its own
 SERVICE = QoSProfile(
@@ -46,7 +46,7 @@ SERVICE = QoSProfile(
 
 
 def to_message(samples: Samples) -> Float64MultiArray:
-    """Return the message of a block."""
+    """Convert a block to a message."""
     data, dims = encode(samples)
     # array('d', ndarray) goes through Python floats and takes 13 times as long
     return Float64MultiArray(
@@ -60,16 +60,16 @@ def to_message(samples: Samples) -> Float64MultiArray:
 
 def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     """
-    Return the block in a message, of one of some quantities where they are named.
+    Convert a message to a block; `quantities` restricts its quantity, if they are named.
 
-    All nodes take their blocks from here, so what one of them refuses, all refuse.  A value may
-    be no number: each node says what it does then.
+    All nodes call this function, so all refuse the same messages.  Values may be NaN or infinite;
+    each node documents its answer to them.
 
     Raises
     ------
     DataError
-        When the layout is not that of a block, does not fit the data, or is larger than a block,
-        the quantity is another, or the time stamps are not those of samples in a row.
+        When the layout is not that of a block, contradicts the data, or exceeds the largest block.
+        Also when the quantity is wrong, or the time stamps are not those of consecutive samples.
     """
     dims, n = message.layout.dim, len(message.data)
     if n > 2 * MOST:
@@ -88,9 +88,9 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
 
 def publishers(node: Node, topic: str) -> dict[bytes, str]:
     """
-    Return the full name of the node of each publisher of a topic by the publisher's gid.
+    Map the gid of each publisher of a topic to the full name of its node.
 
-    The middleware may hear of a publisher before it hears of its node: that one is `UNNAMED`.
+    The middleware may discover a publisher before its node; the name is then `UNNAMED`.
     """
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     return {
@@ -104,5 +104,5 @@ def publishers(node: Node, topic: str) -> dict[bytes, str]:
 def publisher_ids(node: Node, subscription: Subscription) -> list[bytes]:
     """Return the gids of all publishers of the topic of a subscription."""
     gids = list(publishers(node, subscription.topic_name))
-    # one that is matched may not be listed yet
+    # a matched publisher may not be listed yet
     return gids + [b'unlisted'] * max(0, subscription.get_publisher_count() - len(gids))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The identifier node: captures samples, drives the excitation, and learns the model.
+Identifier node: captures samples, drives the excitation, and identifies the model.
 
-Its worker process imports this package without ROS.
+The worker process of the node imports this package without ROS.
 """

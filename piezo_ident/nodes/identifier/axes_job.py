@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The job that identifies a stage of several axes from a capture; nothing here knows of topics."""
+"""Identify a stage of several axes from a capture; the job is independent of ROS."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from piezo_ident.common.process import Tick
 from piezo_ident.live.capture import Snapshot
 from piezo_ident.nodes.identifier.jobs import IdentificationOutcome
 
-#: what ~/save writes into its folder
+#: name of the file that ~/save writes
 MODEL_FILE = 'axes_model.yaml'
 
 
@@ -73,7 +73,7 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
 
 
 def _known(error: float) -> float | None:
-    """Return an error, or None of a model that ran away: JSON has no infinity."""
+    """Return an error, or None for the infinite error of a diverging model: JSON has no infinity."""
     return error if isfinite(error) else None
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A diagnosis on the graph: diagnose, request the excitation that would decide, diagnose again."""
+"""Diagnose on the graph, request the excitation that would decide, and diagnose again."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 
 
 class Host(Protocol):
-    """What a session needs from its node."""
+    """Services of the node to a session."""
 
     values: dict[str, Any]
 
     def can_excite(self) -> bool:
-        """Return whether an excitation and a stage are there."""
+        """Return whether an excitation and a stage are present."""
 
     def excite(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
-        """Play a program; `ended` gets None, or the reason why it was not captured to its end."""
+        """Play a program; `ended` gets None for a complete capture, else the reason."""
 
     def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
         """Start a job whose result goes to `DiagnosisSession.take_outcome`."""
 
     def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
-        """Publish the last outcome, with notes on what could not be decided."""
+        """Publish the last outcome, with notes on open questions."""
 
     def fail(self, reason: str) -> None:
-        """Report that there is no verdict."""
+        """Report why the diagnosis failed."""
 
 
 class DiagnosisSession:
     """
-    Diagnoses a model until nothing is open, always from the model as it was identified.
+    Diagnoses a model until no question is open or no request is left.
+
+    Each diagnosis begins with the identified model.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ class DiagnosisSession:
     given : StageModel or None
         The model that is diagnosed.
     diagnosis : Diagnosis or None
-        The last one of this model.
+        Last diagnosis of this model.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
@@ -72,12 +74,12 @@ class DiagnosisSession:
         ----------
         model : StageModel
         used : mapping
-            From `Capture.mark`, when the capture up to then went into the model.
+            From `Capture.mark`: the capture up to this mark served to identify the model.
         """
         self.given, self.diagnosis, self._used = model, None, used
 
     def forget(self) -> None:
-        """Take note that the capture was cleared."""
+        """Note that the capture was cleared."""
         self._used = {}
 
     def drop(self) -> None:
@@ -88,18 +90,18 @@ class DiagnosisSession:
 
     @property
     def seconds(self) -> float:
-        """Length of what was captured and did not go into the model [s]."""
+        """Length of the capture that the identification did not use [s]."""
         keys = ('voltage', 'displacement')
         return min(self._capture.seconds_since(self._used, key) for key in keys)
 
     def begin(self) -> str:
         """
-        Begin, and return what is done first.
+        Begin; return a message about the first step.
 
         Raises
         ------
         PiezoIdentError
-            When there is no model, or neither data nor an excitation.
+            When the model is missing, or data and excitation are both missing.
         """
         self.drop()
         if self.given is None:
@@ -119,7 +121,7 @@ class DiagnosisSession:
         return self._reason(wanted)
 
     def _hindrance(self) -> str:
-        """Return why no excitation can be requested, empty when it can."""
+        """Return the reason against a request to the excitation, or ''."""
         most = self._host.values['requests']
         if len(self._requested) >= most:
             return f'no more than {most} requests are allowed'
@@ -152,7 +154,7 @@ class DiagnosisSession:
             self._conclude(self._last)
 
     def take_outcome(self, outcome: DiagnosisOutcome) -> None:
-        """Request the experiment that would decide what is open, or conclude."""
+        """Request the experiment that would decide an open question, or conclude."""
         if outcome.diagnosis is not None:
             self._last = outcome
         wanted, hindrance = outcome.wanted, self._hindrance()

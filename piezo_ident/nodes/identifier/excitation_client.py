@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The identifier's client of the excitation: set its program, start it, follow it to the end.
+Set a program of the excitation, start it, and follow it to its end, for the identifier.
 
-The excitation gets back the program that it had as soon as it has answered to the start, or the
-next ``~/start`` would play what somebody else had asked for.
+The client restores the earlier program of the excitation once it has answered to the start.
+Otherwise the next ``~/start`` of a person would play the program of the identifier.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-#: states of the excitation in which it has ended, one way or the other, or not begun
+#: states of the excitation before the beginning and after the end of a program
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
-#: before the first word since it was asked to start: what it said of an earlier run says nothing
+#: state before the first status of this run: an earlier status is about an earlier run
 _UNHEARD = 'unheard'
-#: how long the last blocks may be under way after the excitation says done [s]
+#: longest travel of the last blocks after the excitation says done [s]
 _TAIL = 1.0
-#: how long a stage that warns may leave the voltage unanswered [s]: a rate that it refuses, say
+#: longest time for which a warning stage may leave the voltage unanswered [s]: it may refuse the
+#: rate, for example
 _UNANSWERED = 3.0
-#: after how long a request that is not answered is sent once more [s]
+#: time after which an unanswered request is sent again [s]
 _AGAIN = 2.0
 
 
@@ -50,16 +51,16 @@ class ExcitationClient:
     """
     Plays one program of the excitation at a time.
 
-    No call waits; `poll` looks for responses.
+    All calls return at once; `poll` looks for responses.
 
     Parameters
     ----------
     node : Node
         Gets the clients and the subscription.
     streams : callable
-        Returns the `Streams` as they are now.
+        Returns the present `Streams`.
     missing : callable
-        Returns the topics without a publisher, as text; empty when there is none.
+        Returns the topics without a publisher, as text; '' if all have one.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class ExcitationClient:
         # the client and the request of the future, and when it was sent
         self._asks: tuple[Any, Any] = (None, None)
         self._asked = 0.0
-        # the program that the excitation had, as long as it has another one
+        # the earlier program of the excitation, until it is restored
         self._before: Any = None
         self._looks = Looks()
         self._state, self._message, self._sent = '', '', 0
@@ -92,17 +93,17 @@ class ExcitationClient:
 
     @property
     def running(self) -> bool:
-        """Whether a run is under way."""
+        """Whether a run has begun and not ended."""
         return bool(self._phase)
 
     @property
     def is_starting(self) -> bool:
-        """Whether the excitation has been called and has not responded yet."""
+        """Whether the answer to the start of the excitation is awaited."""
         return self._phase == 'starting'
 
     @property
     def waits_for(self) -> str:
-        """What a run waits for before the first block, for people; empty when there is none."""
+        """Cause of the wait for the first block, for people; '' after the first block."""
         if self._phase == 'finding':
             missing = self._missing()
             return (
@@ -116,7 +117,7 @@ class ExcitationClient:
 
     @property
     def is_possible(self) -> bool:
-        """Whether an excitation and a stage are there, as far as is known now."""
+        """Whether an excitation and a stage have been discovered."""
         ready = self._set.service_is_ready() and self._start.service_is_ready()
         return ready and not self._missing()
 
@@ -148,20 +149,20 @@ class ExcitationClient:
         self._sign = time.monotonic()
 
     def stop(self) -> bool:
-        """Give up the run; return whether the excitation was started, and is to ramp to rest."""
+        """Give up the run; return whether the excitation was told to ramp to rest."""
         is_started = self._phase in ('starting', 'playing') and self._stop.service_is_ready()
         if is_started:
             self._stop.call_async(Trigger.Request())
         phase, self._phase = self._phase, ''
         if phase == 'starting' and self._future is not None:
-            # not before it has begun with the other one
+            # the excitation must begin with the program of the run first
             self._future.add_done_callback(self._give_back)
         elif phase in ('setting', 'starting'):
             self._give_back()
         return is_started
 
     def _give_back(self, *_: object) -> None:
-        """Set the program that the excitation had; later, where another run has begun already."""
+        """Restore the earlier program of the excitation, unless another run is being started."""
         if self._before is not None and self._phase not in ('setting', 'starting'):
             self._set.call_async(_program(self._before))
             self._before = None
@@ -181,7 +182,7 @@ class ExcitationClient:
             return
         self._sign = time.monotonic()
         if self._state not in _RESTING:
-            # a status latched before this run is not about it
+            # only such a status is about this run: an older latched status says it is at rest
             self._active = True
             try:
                 self.progress = float(values.get('progress', '0'))
@@ -224,9 +225,9 @@ class ExcitationClient:
         self._asks = client, request
 
     def _insisted(self, doing: str) -> Any:
-        """Return the response to what was sent; without one, send it again after a time."""
+        """Return the response to the last request; send the request again after a while."""
         response = self._response(doing)
-        # a request is lost before both sides have matched; asking twice is harmless
+        # a request before both sides have matched is lost; a second request is harmless
         if response is None and self.running and time.monotonic() - self._asked > _AGAIN:
             client, request = self._asks
             client.remove_pending_request(self._future)
@@ -234,7 +235,7 @@ class ExcitationClient:
         return response
 
     def _asking(self) -> None:
-        # who remapped the services before this one was asked keeps the program of the run
+        # an excitation without this service keeps the program of the run
         if self._get.service_is_ready() or time.monotonic() - self._sign < _AGAIN:
             response = self._insisted('telling its program')
             if response is None:
@@ -263,7 +264,7 @@ class ExcitationClient:
         response = self._response('starting')
         if response is None:
             return
-        # whatever it plays where it refuses is not this node's to stop
+        # an excitation that refuses plays a program of someone else, which must not be stopped
         self._phase = 'playing' if response.success else 'refused'
         self._give_back()
         if not response.success:
@@ -301,7 +302,7 @@ class ExcitationClient:
         started = self._active or heard
         if started and self._state == 'done':
             self._done = self._done or now
-            # a driver that sends its answers in batches is as late with the last
+            # a driver that answers in batches is as late with its last answer
             newest, patience = max(self._done, self._stage_sign), max(_TAIL, 2.0 * self._slowest)
             is_whole = streams.voltage - self._first.voltage >= self._sent and not behind
             if is_whole or self._looks.is_over(newest, patience):
@@ -319,12 +320,12 @@ class ExcitationClient:
 
 
 def _program(value: Any) -> SetParameters.Request:
-    """Return the request that sets the program of the excitation."""
+    """Make the request that sets the program of the excitation."""
     return SetParameters.Request(parameters=[ParameterMessage(name='program', value=value)])
 
 
 def _moved(time: float, before: float) -> bool:
-    """Return whether a stream has advanced; both times are NaN while there is none."""
+    """Return whether a stream has advanced; both times are NaN before its first sample."""
     return time != before and not (math.isnan(time) and math.isnan(before))
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the identifier hears: blocks of voltage, displacement and channels, to be captured."""
+"""Receive the blocks of voltage, displacement and channels that the identifier captures."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantit
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-#: quantities that a topic may say it carries, beside its own name
+#: further quantities that the blocks of a topic may carry, beside the name of the topic
 _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 
 
 class Inputs:
     """
-    The streams of a capture.
+    Streams of a capture.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Inputs:
     Attributes
     ----------
     passed : Counter
-        Samples that came on each topic.
+        Number of samples that came on each topic.
     """
 
     def __init__(self, node: Node, capture: Capture, channels: Sequence[str]) -> None:
@@ -54,7 +54,7 @@ class Inputs:
                 self._subscriptions.add(f'{home}/{applied}' if home else applied, applied)
 
     def drain(self, *, hold: bool) -> None:
-        """Capture what has come, or keep it for later."""
+        """Capture the received blocks, or keep them for later."""
         self._subscriptions.drain()
         while self._held and not hold:
             self._take(*self._held.popleft())
@@ -66,7 +66,7 @@ class Inputs:
             samples = from_message(message)
             known = (*_CARRIED.get(key, (key.removeprefix('applied_'),)), key) if key else ()
             quantity = samples.quantity
-            # a further axis or channel names itself
+            # a block of a further axis or channel names its quantity
             if quantity not in known and (key or not channel_of_quantity(quantity)):
                 base = topic.rpartition('/')[2]
                 wanted = key or (base if channel_of_quantity(base) else 'x_<name>')
@@ -79,18 +79,18 @@ class Inputs:
         self.passed[topic] += samples.t.size
 
     def streams(self) -> Streams:
-        """Return what the client of the excitation follows."""
+        """Return the state of the streams, for the client of the excitation."""
         c = self._capture
         answered = c.last_time('displacement')
         for key in c.keys:
-            # the stage sends all of them, one after the other: a run ends with the last one
+            # the stage sends these topics one after the other; a run ends with the last of them
             if key.startswith((APPLIED, 'displacement_')):
                 answered = min(answered, c.last_time(key))
         return Streams(self.passed['voltage'], c.last_time('voltage'), answered)
 
     @property
     def unpublished(self) -> str:
-        """Topics without a publisher: before it is met, what it sends is lost."""
+        """Topics without a matched publisher, whose messages would be lost."""
         topics = self._subscriptions.unpublished
         driven = ('voltage', APPLIED)
         return ', '.join(t for t in topics if not t.rpartition('/')[2].startswith(driven))

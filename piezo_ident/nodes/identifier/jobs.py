@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The jobs of the identifier's worker process; nothing here knows of topics.
+Jobs of the worker process of the identifier, independent of ROS.
 
-Jobs are sent to another process: each is a function of this module whose last argument, `tick`,
-the worker adds.
+Each job is a function of this module, which is sent to another process.  The worker adds its last
+argument, `tick`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import headline, json_text, steps_to_json, write_report
 
-#: the shortest program that all three steps take
+#: a program as short as all three steps allow
 _SMALL = """
 limits: [0, 10]
 slew: 500
@@ -42,12 +42,12 @@ segments:
   - {signal: triangle, slope: 100}
 """
 
-#: a record whose voltage moves by less than this share of the model's range is not driven
+#: smallest motion of the voltage of a driven record, as a share of the range of the model
 DRIVEN = 0.01
-#: folder of the report of a diagnosis, inside that of the identification
+#: folder of the report of a diagnosis, inside the folder of the identification
 FOLDER = 'diagnosis'
 
-#: share of the whole at which each step begins and ends
+#: shares of the whole work at which each step begins and ends
 _SHARES = {
     'delay': (0.02, 0.05),
     'dynamics': (0.05, 0.8),
@@ -68,9 +68,9 @@ class IdentificationOutcome:
     message : str
         One line for people.
     brief : str
-        The same in few words, a number first.
+        The message in few words, a number first.
     figures : mapping of str to str
-        The numbers in the message.
+        Numbers of the message.
     report : str
         JSON.
     warnings : int
@@ -93,7 +93,7 @@ class IdentificationOutcome:
 
 
 def with_warnings(text: str, count: int) -> str:
-    """Return a text with the number of warnings in the report behind it."""
+    """Append the number of warnings in the report to a text."""
     if not count or not text:
         return text
     return f'{text.rstrip(".")}; {count} warning{"s" * (count > 1)} in the report'
@@ -101,7 +101,7 @@ def with_warnings(text: str, count: int) -> str:
 
 def settings_of(values: dict[str, object]) -> Settings:
     """
-    Return the settings that a node's parameters ask for.
+    Make the settings of an identification from the parameters of the node.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def settings_of(values: dict[str, object]) -> Settings:
 
 
 def percent_of(step: str, share: float) -> float:
-    """Return the progress of the whole in percent."""
+    """Return the progress of the whole work in percent."""
     low, high = _SHARES.get(step, (0.0, 1.0))
     return 100.0 * (low + (high - low) * share)
 
@@ -147,7 +147,7 @@ def identify_capture(
     steps : Steps or None
         Results of earlier steps; for single steps only.
     before : StageModel or None
-        The model of this stage until now.
+        Earlier model of this stage.
     tick : callable
     """
     tick('record', 0.0)
@@ -181,7 +181,7 @@ def identify_capture(
 
 
 def _reversed(model: StageModel, before: StageModel | None) -> Iterator[str]:
-    """Yield a warning where the displacement has another sign than it had."""
+    """Yield a warning if the displacement has changed its sign."""
     if before is not None and model.scaling.Y * before.scaling.Y < 0.0:
         y, y0 = 1e6 * model.scaling.Y, 1e6 * before.scaling.Y
         yield (
@@ -206,16 +206,16 @@ class DiagnosisOutcome:
     Attributes
     ----------
     diagnosis : Diagnosis or None
-        None when the capture holds no motion.
+        None if the capture lacks motion.
     message, brief, report, model, given : str
-        The sentence, the same in few words, the diagnosis as JSON, the refined model and the given
-        one as YAML.
+        Verdict as a sentence, and in few words; diagnosis as JSON; refined and given model as
+        YAML.
     figures : mapping of str to str
-        The numbers in the sentence.
+        Numbers of the sentence.
     warnings : int
         Number of warnings and faults of the data in the report.
     wanted : Experiment or None
-        The experiment that would decide what is open.
+        Experiment that would decide an open question.
     """
 
     diagnosis: Diagnosis | None
@@ -231,9 +231,9 @@ class DiagnosisOutcome:
 
 def records_of_runs(record: Record) -> list[Record]:
     """
-    Return each run of the sample clock as a record of its own.
+    Split a record into one record for each run of the sample clock.
 
-    Between two runs an unknown time has passed, so whatever depends on time starts again.
+    An unknown time passes between two runs, so everything that depends on time starts again.
     """
     runs: list[list[Piece]] = []
     for piece in record:
@@ -259,7 +259,7 @@ def diagnose_capture(
     Parameters
     ----------
     snapshot : Snapshot
-        Without what the model was identified from.
+        Capture without the samples that the model was identified from.
     given : StageModel
     asked : tuple of {'sweeps', 'holds'}
         Experiments that the excitation has played already.
@@ -272,7 +272,7 @@ def diagnose_capture(
     if not records:
         return DiagnosisOutcome(None, wanted=next_experiment(None, asked=asked))
     result = diagnose(given, records, settings, progress=tick)
-    # every run is a record of its own, so that a restart of the clock is no fault
+    # every run is a record of its own, so a restart of the clock is harmless
     faults = (fault for fault in record.faults if fault.name != 'restart')
     result = replace(result, faults=(*faults, *result.faults))
     tick('report', 0.99)
@@ -303,7 +303,7 @@ def _is_driven(model: StageModel, record: Record) -> bool:
 def save(
     identified: Identification | None, diagnosis: Diagnosis | None, folder: str, tick: Tick
 ) -> str:
-    """Write models, reports and pictures, those of a diagnosis into a folder inside the other."""
+    """Write models, reports and pictures; a diagnosis gets a folder of its own inside."""
     tick('drawing', 0.0)
     pages: list[Path] = []
     share = 0.5 if identified and diagnosis else 1.0
@@ -319,7 +319,7 @@ def save(
 
 
 def warm_up() -> None:
-    """Compile or load the kernels of an identification, so that the first one is not slower."""
+    """Compile or load the kernels of an identification, so that the first is as fast as others."""
     stage = SimulatedStage.load('paper')
     sequence = parse_program(_SMALL).build(stage.model.sample_rate)
     record = stage.play(sequence, np.random.default_rng(0))

@@ -43,13 +43,13 @@ from std_msgs.msg import String
 
 Result = IdentificationOutcome | DiagnosisOutcome | str
 
-#: how often the run of the excitation is looked at [s]
+#: time between two looks at the run of the excitation [s]
 POLL = 0.05
-#: how often it is told how much was captured [s]
+#: time between two reports of the length of the capture [s]
 TELL = 0.5
-#: how often it is looked for what has come [s]
+#: time between two emptyings of the subscriptions [s]
 DRAIN = 0.02
-#: how long the end of the node waits for the work to end [s]
+#: longest wait for the end of the work when the node ends [s]
 PATIENCE = 0.6
 
 
@@ -69,7 +69,7 @@ class IdentifierNode(LabNode):
         # the last model of several axes, as text
         self._axes = ''
         self._session = DiagnosisSession(self, self._capture)
-        # what the running job uses of the capture, and the model last published
+        # mark of the capture that the running job uses, and the last published model
         self._using, self._published = dict[str, int](), ''
         if path := self.values['model']:
             self._session.take(load(path), {})
@@ -103,7 +103,7 @@ class IdentifierNode(LabNode):
     # capture
 
     def _drain(self) -> None:
-        # the earlier capture is kept until the excitation has accepted the start
+        # blocks wait until the excitation has accepted the start, which clears the earlier capture
         self._inputs.drain(hold=self._excitation.is_starting)
 
     # state
@@ -116,11 +116,11 @@ class IdentifierNode(LabNode):
 
     def _poll(self) -> None:
         if self._excitation.running:
-            # all of a run is captured before it counts as ended
+            # a run may end once all its blocks are captured
             self._drain()
             self._excitation.poll()
         if waits_for := self._excitation.waits_for:
-            # what is captured is that of before
+            # the capture is still the earlier one
             self._set_state('exciting', 0.0, f'{self._task}: {waits_for}')
         elif self._excitation.running:
             segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
@@ -143,7 +143,7 @@ class IdentifierNode(LabNode):
         return ', '.join(f'{self._capture.seconds_of(key):.3f} s of {key}' for key in keys)
 
     def _is_busy(self) -> bool:
-        # parameters are declared before the rest exists
+        # parameters are declared before the other attributes exist
         return hasattr(self, '_excitation') and (self._excitation.running or self._worker.is_busy)
 
     def _refuse_when_busy(self) -> None:
@@ -280,7 +280,7 @@ class IdentifierNode(LabNode):
         return f'{self._session.begin()}; see ~/status'
 
     def can_excite(self) -> bool:
-        """Return whether an excitation and a stage are there."""
+        """Return whether an excitation and a stage are present."""
         return self._excitation.is_possible
 
     def excite(
@@ -313,7 +313,7 @@ class IdentifierNode(LabNode):
         self._set_state('done', 100.0, text, level, brief=brief, **figures)
 
     def fail(self, reason: str) -> None:
-        """Report why there is no verdict."""
+        """Report why the work failed."""
         self._set_state('failed', 0.0, reason, ERROR)
 
     def _publish_model(self, text: str) -> None:
@@ -328,7 +328,7 @@ class IdentifierNode(LabNode):
         self.report_status(state, percent, step, brief=f'{percent:.0f} %: {step}')
 
     def _ended(self, result: Result | None, error: Exception | None) -> None:
-        # published by the executor, so that the worker is free when the end is reported
+        # the executor publishes the result, so that the worker is free when the end is reported
         self._outcomes.append(functools.partial(self._conclude, result, error))
         self._wake.trigger()
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One job at a time in a process of its own, watched by a thread."""
+"""Run one job at a time in another process, watched by a thread."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ EVERY = 0.1
 
 class Worker:
     """
-    Does one job at a time without holding up its owner.
+    Runs one job at a time without delaying the caller.
 
     Parameters
     ----------
     nice : int, optional
-        By how much the process gives way to others.
+        Niceness of the process: a larger one leaves more time to other processes.
     warm_up : callable, optional
-        A function of a module that the process calls first.
+        Function of a module that the process calls first.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
@@ -53,9 +53,9 @@ class Worker:
         ----------
         job : callable
         progress : callable
-            Called with the step and its share done, some times a second, in another thread.
+            Called with the step and its share done, at most every `EVERY`, in another thread.
         ended : callable
-            Called with the result and None, or None and the error, in another thread.
+            Called with the result and the error, one of which is None, in another thread.
         """
         if self.is_busy:
             raise PiezoIdentError('another job runs; wait for its end or cancel it')
@@ -86,7 +86,7 @@ class Worker:
             result = self._process.run(job, tick)
             if self._cancel.is_set():
                 raise Cancelled('cancelled')
-        # whatever the job raises is for the owner to report
+        # the caller reports every error of the job
         except Exception as error:  # noqa: BLE001
             ended(None, error)
         else:
@@ -97,11 +97,11 @@ class Worker:
         self._cancel.set()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end of the job; return whether it came within the time [s]."""
+        """Wait for the end of the job; return whether it ended within the time [s]."""
         if self._thread is not None:
             self._thread.join(timeout)
         return not self.is_busy
 
     def close(self) -> None:
-        """End the process, whatever it does."""
+        """End the process, even during a job."""
         self._process.close()
