@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text or JSON on standard output, progress on a terminal."""
+"""Write text or JSON to standard output, and progress to a terminal."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 @contextmanager
 def deferred_interrupts() -> Iterator[Callable[..., None]]:
     """
-    Have Ctrl-C wait until all outputs of a command are whole.
+    Delay Ctrl-C until all outputs of a command are complete.
 
-    The function that is yielded raises KeyboardInterrupt when an interrupt is waiting, and takes
-    any arguments: long work before the first output calls it.
+    The yielded function raises KeyboardInterrupt if an interrupt is waiting.  Long work before the
+    first output calls it, with any arguments.
     """
     waiting: list[int] = []
 
@@ -35,7 +35,7 @@ def deferred_interrupts() -> Iterator[Callable[..., None]]:
     try:
         before = signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
     except ValueError:
-        # only the main thread is interrupted
+        # only the main thread can be interrupted
         yield check
         return
     try:
@@ -46,22 +46,22 @@ def deferred_interrupts() -> Iterator[Callable[..., None]]:
 
 
 class Console:
-    """Standard output and error of one command; `as_json`: only JSON goes to standard output."""
+    """Standard output and error of one command; `as_json` restricts standard output to JSON."""
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
 
     def say(self, text: str = '') -> None:
-        """Write lines for people; nothing in JSON."""
+        """Write lines for people; with `as_json` they are dropped."""
         if not self.as_json:
             sys.stdout.write(f'{_harmless(text)}\n')
 
     def note(self, text: str) -> None:
-        """Write a line that belongs to no result."""
+        """Write a line to standard error, apart from the result."""
         sys.stderr.write(f'piezo_ident: {_harmless(text)}\n')
 
     def result(self, data: Any) -> None:
-        """Write the result for programs; nothing as text."""
+        """Write the result as JSON; without `as_json` it is dropped."""
         if self.as_json:
             from piezo_ident.model.files import finite, plain
 
@@ -70,7 +70,7 @@ class Console:
 
     @contextmanager
     def notices(self) -> Iterator[None]:
-        """Show what the package logs, such as that it compiles: on a terminal only."""
+        """Show log records of the package, such as compiling, if standard error is a terminal."""
         log = logging.getLogger('piezo_ident')
         handler = _Lines() if sys.stderr.isatty() else logging.NullHandler()
         log.addHandler(handler)
@@ -81,7 +81,7 @@ class Console:
 
     @contextmanager
     def progress(self) -> Iterator[Progress]:
-        """Yield what shows the progress: one bar a step on a terminal, nothing elsewhere."""
+        """Yield a function that shows progress: a bar for each step, on a terminal only."""
         if not sys.stderr.isatty():
             yield lambda step, share: None
             return
@@ -98,7 +98,7 @@ class Console:
                     total=1.0,
                     desc=f'{step:12s}',
                     bar_format='{desc} {percentage:3.0f}% |{bar}| {elapsed}',
-                    # a terminal may not tell its size
+                    # tqdm would ask the terminal, which may not know its size
                     ncols=min(80, size.columns),
                     nrows=size.lines,
                     leave=False,
@@ -115,7 +115,7 @@ class Console:
 
 
 class _Lines(logging.Handler):
-    """Lines on a terminal, above the bars that are there."""
+    """Handler that writes lines on a terminal, above the progress bars."""
 
     def emit(self, record: logging.LogRecord) -> None:
         from tqdm import tqdm
@@ -124,5 +124,5 @@ class _Lines(logging.Handler):
 
 
 def _harmless(text: str) -> str:
-    """Return lines without control characters: names in files must not steer a terminal."""
+    """Replace control characters, so that names in files cannot steer a terminal."""
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``diagnose``: the effect that a model lacks, and what it is worth."""
+"""``diagnose``: find the effect that a model lacks, and measure its benefit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     given = load(args.model_file)
     records, validation = read_both(paths, further, args, console)
     for record in validation:
-        # they are predicted in the end, and must not fail there
+        # refused now: these records are predicted after the long work
         with naming(record.name):
             for piece in record:
                 given.check_rate(piece)
@@ -83,7 +83,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
 def _of_each(
     diagnosis: Diagnosis | EachAxis[Diagnosis],
 ) -> list[tuple[dict[str, str], Diagnosis]]:
-    """Return the diagnoses, each with the name of its axis where there are several."""
+    """List the diagnoses; each of several axes comes with the name of its axis."""
     if isinstance(diagnosis, EachAxis):
         return [({'axis': axis}, x) for axis, x in diagnosis.items()]
     return [({}, diagnosis)]
@@ -95,13 +95,13 @@ def _changes(diagnosis: Diagnosis | EachAxis[Diagnosis]) -> str:
 
 
 def _named(diagnosis: Diagnosis, given: StageModel, records: Sequence[Record]) -> Diagnosis:
-    """Return a diagnosis that warns of records from which the model was identified."""
+    """Add warnings about records from which the model may have been identified."""
     told = _of_names(given, records)
     return replace(diagnosis, warnings=(*told, *diagnosis.warnings))
 
 
 def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:
-    """Say which records have the name of one that the model was identified from."""
+    """Warn about each record whose name is among the records of the identification."""
     used = given.identification.get('records')
     known = used if isinstance(used, Sequence) else ()
     return [

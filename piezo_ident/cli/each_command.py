@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``--each``: every record on its own, with a table of them all."""
+"""``--each``: process every record on its own, and write a table of all records."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, csv_text, Row, unit_of
 from piezo_ident.model.files import load
 
-#: failed records that are printed
+#: most failed records that are printed
 PRINTED = 10
-#: columns whose spread is printed: name, unit for people, and factor from that of the table
+#: columns whose spread is printed: name, unit for people, and factor from the unit of the table
 SPREAD = {
     'error_held_out': ('held-out error', '% of stroke', 1.0),
     'error_before': ('error before', '% of stroke', 1.0),
@@ -49,7 +49,7 @@ OTHERS = {
 
 
 def check_each(args: SimpleNamespace) -> None:
-    """Refuse options that go only with --each, or not with it."""
+    """Refuse options that need --each without it, and options that exclude it."""
     if args.each is None:
         for option in ('jobs', 'scheduler', 'reports'):
             if getattr(args, option):
@@ -70,7 +70,7 @@ def identify_each(args: SimpleNamespace, settings: Settings, console: Console) -
 def diagnose_each(args: SimpleNamespace, settings: DiagnosisSettings, console: Console) -> None:
     """Run ``piezo_ident diagnose MODEL RECORD... --each DIR``."""
     if not args.model_file.is_dir():
-        # a bad model is one error, not one a record
+        # a bad model is a single error, instead of an error for each record
         load(args.model_file)
     _each(args, Diagnose(args.model_file.absolute(), settings, options_of(args)), console)
 
@@ -83,7 +83,7 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
 
         def show(done: int, of: int, row: Row | None) -> None:
             progress('records', done / of)
-            # a log shows no bar
+            # without a terminal a line replaces the bar
             if row and not sys.stderr.isatty():
                 console.say(f'{done} of {of}: {row.record}{"" if row.is_good else " failed"}')
                 sys.stdout.flush()
@@ -122,14 +122,14 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
 
 
 def _told(row: Row) -> tuple[str, str]:
-    """Return the columns of a verdict: of a refit, what may hide in it."""
+    """Name the columns of a verdict; a refit shows the effects that may hide in it."""
     return 'verdict', 'alike' if row.values.get('verdict') == 'refitted' else 'effects'
 
 
 def _print(
     rows: Sequence[Row], bad: Sequence[Row], console: Console
 ) -> dict[str, dict[str, float]]:
-    """Print a summary of all records, and return those that stand out."""
+    """Print a summary of all records; return the records that stand out."""
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
         console.say(f'  {row.record}: {row.reason}')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``effects``: the catalogue, and one effect at length."""
+"""``effects``: print the catalogue, or one effect in detail."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.effects import catalogue, Effect, Parameter
 
-#: [characters]
+#: width of the text [characters]
 WIDTH = 99
 
 
 def effect_name(text: str) -> str:
-    """Return the name of an effect."""
+    """Check the name of an effect; ConfigError suggests a similar name."""
     if text in catalogue():
         return text
     close = difflib.get_close_matches(text.lower().replace('-', '_'), catalogue(), n=1)
@@ -31,7 +31,7 @@ def effect_name(text: str) -> str:
 
 
 def effect_names(texts: Sequence[str]) -> tuple[str, ...]:
-    """Return names of effects, given one by one or joined by commas, each once."""
+    """Split names of effects at commas, check them, and drop repeated names."""
     names = [name.strip() for text in texts for name in text.split(',')]
     return tuple(dict.fromkeys(effect_name(name) for name in names if name))
 
@@ -65,7 +65,7 @@ def _about(effect: type[Effect]) -> str:
 
 
 def _documentation(effect: type[Effect]) -> str:
-    # a plug-in without a text of its own must not borrow that of the base class
+    # `inspect.getdoc` would give a plug-in without a docstring the text of the base class
     return inspect.cleandoc(effect.__doc__ or '')
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of a command line: records that are read, and outputs, checked before the work."""
+"""Read the records of a command line, and check its outputs before the work."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Fault, Record
 
-#: faults that are shown when a record has been read
+#: faults that are shown directly after reading a record
 SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'large_gain', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
-#: what may be a record, but is often something else
+#: suffixes of files that may be records, but often are other texts
 UNCERTAIN = ('.txt', '.dat', '.asc')
-#: size from which such a file is no notes [bytes]
+#: smallest size of such a file that suggests a record instead of notes [bytes]
 NOTES = 20_000
-#: what a folder is searched for
+#: suffixes of the files that are searched in a folder
 RECORD_FILES = (*(x for x in READERS if x not in UNCERTAIN), *BAG_FILES)
 TABLE_FILES = ('.csv', '.npz')
 PICTURES = ('.png', '.pdf', '.svg')
 
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:
-    """Return the records that are named: a folder that is no bag stands for all in it."""
+    """List the named records; a folder other than a bag stands for all records in it."""
     from piezo_ident.many.run import MARK
 
     records = []
@@ -54,10 +54,10 @@ def expand(paths: Sequence[Path], console: Console) -> list[Path]:
                 inside.append(place)
             elif place.is_dir():
                 below = sorted(filter(_is_record, place.glob('[!.]*')))
-                # of a bag that was not finished
+                # parts of an unfinished bag
                 parts = [*filter(storage_of, below)]
                 inside += parts
-                # the results of many records are none
+                # MARK means a folder with results of --each
                 if len(below) > len(parts) and not (place / MARK).is_file():
                     skipped.append(place.name)
             elif place.suffix.lower() in UNCERTAIN and place.is_file():
@@ -90,9 +90,9 @@ def _is_named_as_record(path: Path) -> bool:
 def expand_apart(
     records: Sequence[Path], validation: Sequence[Path], console: Console
 ) -> tuple[list[Path], list[Path]]:
-    """Return the records that are named for a model and for its validation."""
+    """List the records for a model and for its validation; refuse a record in both."""
     paths, further = expand(records, console), expand(validation, console)
-    # pathlib has an error of its own for links in a circle
+    # realpath, because Path.resolve raises its own error for circular links
     fitted = set(map(os.path.realpath, paths))
     for path in further:
         if os.path.realpath(path) in fitted:
@@ -110,7 +110,7 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
-    """Refuse options that choose topics where no record is a bag, or columns where all are."""
+    """Refuse options for bags if all records are tables, and the other way round."""
     tables = all(p.is_file() and not storage_of(p) for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
         if tables and getattr(args, option, None) is not None:
@@ -127,13 +127,13 @@ def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
 
 
 def fields_of(args: SimpleNamespace, kind: type) -> dict[str, Any]:
-    """Return the options that are fields of settings; those that are absent keep the defaults."""
+    """Pick the given options that are fields of `kind`; absent options keep their defaults."""
     named = {f.name: getattr(args, f.name, None) for f in fields(kind)}
     return {name: x for name, x in named.items() if x is not None}
 
 
 def options_of(args: SimpleNamespace) -> ReadOptions:
-    """Return how the arguments have records read."""
+    """Make the options for reading records from the arguments."""
     return ReadOptions(**fields_of(args, ReadOptions))
 
 
@@ -141,9 +141,9 @@ def read_all(
     paths: Sequence[Path], args: SimpleNamespace, console: Console, **further: Any
 ) -> list[Record]:
     """
-    Read the records of one call, and say how columns and units were taken.
+    Read the records of one call, and report the chosen columns and units.
 
-    Files of one name keep their folders in their names.
+    Files with the same name keep their folders in the names of their records.
     """
     check_bag_options(paths, args)
     options = replace(options_of(args), **further)
@@ -160,7 +160,7 @@ def read_all(
                 'piezo_ident convert --displacement-unit um IN OUT.npz'
             ) from None
         records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
-    # before the work: a wrong unit may be what it fails of
+    # reported before the work, which a wrong unit may let fail
     shown: dict[Fault, list[Record]] = {}
     for record in records:
         for fault in record.faults:
@@ -174,7 +174,7 @@ def read_all(
 
 
 def spans(records: Sequence[Record]) -> str:
-    """Return the strokes and voltages that the numbers in some files stand for."""
+    """Describe the strokes and voltages of records, as a check of their units."""
     strokes = [1e6 * record.stroke for record in records]
     ends = [end for record in records for end in record.voltage_range]
     parts = []
@@ -187,7 +187,7 @@ def spans(records: Sequence[Record]) -> str:
 
 
 def print_faults(record: Record, losses: Sequence[str], console: Console) -> None:
-    """Print the faults of a record, and the losses of the file that it was written to."""
+    """Print the faults of a record, and the data that its output file cannot keep."""
     for fault in record.faults:
         if fault.name not in SHOWN:
             console.say(f'met: {fault}')
@@ -196,7 +196,7 @@ def print_faults(record: Record, losses: Sequence[str], console: Console) -> Non
 
 
 def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the size of a record, its faults, and the losses of its file, for programs."""
+    """Return size and faults of a record, and the losses of its output file, for JSON."""
     return {
         'record': record.name,
         'pieces': len(record.pieces),
@@ -213,7 +213,7 @@ def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
-    """Refuse a suffix that names no format."""
+    """Refuse an unknown suffix."""
     known = list(suffixes)
     if path.suffix.lower() not in known:
         names = ', '.join(s or 'a folder' for s in known)
@@ -225,7 +225,7 @@ def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
 def check_output(
     path: Path, suffixes: Iterable[str], what: str, *, inputs: Iterable[Path], overwrite: bool
 ) -> None:
-    """Refuse a file whose suffix names no format, that is an input, or cannot be written."""
+    """Refuse an output that has an unknown suffix, is an input, or cannot be written."""
     check_suffix(path, suffixes, what)
     check_distinct(path, inputs)
     check_file(path, overwrite=overwrite)
@@ -239,7 +239,7 @@ def check_link(path: Path) -> None:
 
 
 def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
-    """Refuse an output that could not be written in the end; a bag may be a folder too."""
+    """Refuse an output that cannot be written; `folder_too` allows a folder, which a bag may be."""
     check_link(path)
     try:
         if path.is_dir() and not folder_too:
@@ -258,7 +258,7 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder in which files could not be written in the end; it need not exist yet."""
+    """Refuse a folder in which files cannot be written; it may be missing still."""
     check_link(path)
     try:
         if path.exists() and not path.is_dir():
@@ -279,8 +279,8 @@ def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
 
 
 def check_apart(output: Path, record: Path) -> None:
-    """Refuse to write a record over another, into the folder of it, or where that lies below."""
-    # pathlib has an error of its own for links in a circle
+    """Refuse an output that is the record, lies in its folder, or contains it."""
+    # realpath, because Path.resolve raises its own error for circular links
     out, given = (Path(os.path.realpath(path)) for path in (output, record))
     if out == given or out in given.parents or given in out.parents:
         raise DataError(
@@ -289,6 +289,6 @@ def check_apart(output: Path, record: Path) -> None:
 
 
 def _try(folder: Path) -> None:
-    # root passes every permission bit, and a read-only file system shows only when written to
+    # only a real file tells: root passes all permission bits, and a file system may be read-only
     with tempfile.TemporaryFile(dir=folder, prefix='.piezo_ident.'):
         pass

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``identify``, and what it shares with ``diagnose``."""
+"""``identify``, and functions that ``diagnose`` uses, too."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
 def checked(
     args: SimpleNamespace, kind: type, console: Console, *others: Path
 ) -> tuple[list[Path], list[Path]]:
-    """Return the records for the work and for validation; refuse outputs before the work."""
+    """List the records for the work and for validation; refuse bad outputs before the work."""
     from piezo_ident.report import check_report_folder
 
     paths, further = expand_apart(args.records, args.validation, console)
@@ -85,7 +85,7 @@ def checked(
     if args.model is not None:
         check_suffix(args.model, MODEL_FILES, 'a model')
         check_distinct(args.model, inputs)
-        # a report makes its folder first
+        # a model inside the folder of the report: the report makes the folder first
         if args.model.parent != args.report or args.report.is_dir():
             check_file(args.model, overwrite=args.overwrite)
     if args.report is not None:
@@ -105,13 +105,13 @@ def checked(
 def read_both(
     paths: Sequence[Path], further: Sequence[Path], args: SimpleNamespace, console: Console
 ) -> tuple[list[Record], list[Record]]:
-    """Read records and those for validation as the records of one call."""
+    """Read records and validation records as the records of one call."""
     everything = read_all([*paths, *further], args, console)
     return everything[: len(paths)], everything[len(paths) :]
 
 
 def prompt_of(args: SimpleNamespace, records: Sequence[Record], paths: Sequence[Path]) -> Prompt:
-    """Return how the files of a call are named, for the commands that are suggested."""
+    """Collect the names of the files of a call, for the suggested commands."""
     from piezo_ident.report import Prompt
 
     given = getattr(args, 'model_file', '')
@@ -127,27 +127,27 @@ def prompt_of(args: SimpleNamespace, records: Sequence[Record], paths: Sequence[
 
 
 def _words(value: Any) -> list[str]:
-    """Return the value of an option as it is typed."""
+    """Format the value of an option as typed on a command line."""
     if isinstance(value, Mapping):
         return [','.join(f'{key}={x}' for key, x in value.items())]
     return [f'{x:g}' if isinstance(x, float) else str(x) for x in np.atleast_1d(value).tolist()]
 
 
 def print_next(result: Results, prompt: Prompt, console: Console) -> list[dict[str, str]]:
-    """Print what to do next by its command lines, and return that for programs."""
+    """Print the suggested next steps with their command lines; return them for JSON."""
     from piezo_ident.report import next_steps
 
     steps = next_steps(result, prompt)
     console.say('\nnext:')
     for step in steps:
         console.say(textwrap.indent(textwrap.fill(f'{step.reason}:', 97), '  '))
-        # in one line, to be copied
+        # the command stays in one line, for copying
         console.say(f'      {step.command}')
     return [asdict(step) for step in steps]
 
 
 def keep(result: Results, args: SimpleNamespace, prompt: Prompt) -> None:
-    """Write report and model where the arguments say."""
+    """Write report and model to the places in the arguments."""
     from piezo_ident.report import write_report
 
     with deferred_interrupts() as check:
@@ -158,7 +158,7 @@ def keep(result: Results, args: SimpleNamespace, prompt: Prompt) -> None:
 
 
 def print_files(args: SimpleNamespace, console: Console, note: str = '') -> dict[str, Any]:
-    """Print where model and report are, and return that for programs."""
+    """Print the places of model and report; return them for JSON."""
     page = None if args.report is None else str(args.report / 'report.html')
     console.say()
     if args.model is not None:

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Arguments in, exit code out.
+Parse the arguments, run a verb, and return an exit code.
 
 Exit codes: 0 when done, 2 with one line on standard error for bad input, 130 when interrupted.
-Nothing heavy is imported before the arguments are parsed.
+Heavy modules are imported after the arguments are parsed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import PiezoIdentError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
-#: verbs that share a module, which is called by its own name otherwise
+#: module of each verb that shares one; any other verb has a module of its own name
 HOMES = {
     **dict.fromkeys(('convert', 'simulate'), 'record'),
     **dict.fromkeys(('predict', 'invert', 'export'), 'model'),
@@ -41,7 +41,7 @@ OUT_HELP = 'OUT is a .csv, .npz, .mat, .mcap or .db3 file, or a folder for a ros
 
 
 def _examples(lines: Sequence[str]) -> str:
-    # \b keeps the lines apart
+    # \b makes click keep the lines
     return '\n'.join(['\b', 'Examples:', *(f'  piezo_ident {line}' for line in lines)])
 
 
@@ -51,7 +51,7 @@ def _guess(word: str, known: Iterable[str]) -> str:
 
 
 class Verb(click.Command):
-    """A verb with its options by sections; it returns what was given to it, and does nothing."""
+    """Verb with its options by sections; it only returns the parsed arguments."""
 
     def __init__(
         self,
@@ -94,14 +94,14 @@ class Verb(click.Command):
 
 
 class Verbs(click.Group):
-    """All verbs; for a misspelt one it names those that are close."""
+    """Group of all verbs; its error suggests a verb for a misspelt one."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the verbs in the order in which they are used."""
+        """List the verbs in the order of use."""
         return list(self.commands)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
-        """Return the verb and what follows it."""
+        """Return the verb and its arguments."""
         if not ctx.resilient_parsing and args[0] not in self.commands:
             guess = _guess(args[0], self.commands) or f'give {", ".join(self.commands)}'
             ctx.fail(f'no such verb: {args[0]}; {guess}')
@@ -242,7 +242,7 @@ def _told(error: click.UsageError) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command, with the arguments of the process by default, and return the exit code."""
+    """Run a command; default arguments are those of the process.  Return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
 
     def stop(code: int, text: str, kind: str) -> int:
@@ -262,11 +262,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not isinstance(given, SimpleNamespace):  # help or version
             return int(given or DONE)
         if 'numpy' not in sys.modules:
-            # the matrices are narrow: a second thread of BLAS gains nothing, and on a busy
-            # machine makes identifications eight times slower
+            # the matrices are narrow: a second thread of BLAS saves no time, and slows an
+            # identification down eight times on a busy machine
             for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
                 os.environ.setdefault(name, '1')
-        # a verb imports only what it needs
+        # imports the modules of this verb alone
         home = HOMES.get(given.verb, given.verb)
         module = importlib.import_module(f'piezo_ident.cli.{home}_command')
         console = Console(given.json)
@@ -274,14 +274,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             getattr(module, f'{given.verb}_command')(given, console)
         sys.stdout.flush()
         if argv is None:
-            # all is written; an interrupt of the interpreter's end would print a traceback
+            # all is written; an interrupt while the interpreter ends would print a traceback
             signal.signal(signal.SIGINT, signal.SIG_IGN)
     except (KeyboardInterrupt, click.Abort):
         if argv is None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         return stop(INTERRUPTED, 'interrupted; no output is half written', 'Interrupted')
     except BrokenPipeError:
-        # the reader has read enough; the interpreter's own flush must not complain
+        # the reader has closed the pipe; the final flush of the interpreter must not fail
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except click.UsageError as error:
         return stop(BAD_INPUT, _told(error), 'UsageError')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``predict``, ``invert`` and ``export``: what a model is for."""
+"""``predict``, ``invert`` and ``export``: use a model."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
 
 def _checked(args: SimpleNamespace, what: str) -> StageModel | MultiAxisModel:
-    """Return the model; refuse outputs that cannot be written, and files in the wrong order."""
+    """Load the model; refuse outputs that cannot be written, and files in the wrong order."""
     for path, suffixes, content in (
         (args.out, TABLE_FILES, what),
         (args.plot, PICTURES, 'a picture'),
@@ -58,7 +58,7 @@ def _checked(args: SimpleNamespace, what: str) -> StageModel | MultiAxisModel:
 
 
 def _wrote(args: SimpleNamespace, console: Console) -> dict[str, str | None]:
-    """Print which files were written, and return them for programs."""
+    """Print the written files; return them for JSON."""
     files: dict[str, Path | None] = {'out': args.out, 'plot': args.plot}
     for path in filter(None, files.values()):
         console.say(f'wrote {path}')
@@ -70,7 +70,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     model = _checked(args, 'a prediction')
     (record,) = read_all([args.record], args, console, voltage_alone=True)
     data: dict[str, Any] = {'model': str(args.model)}
-    # nothing that stands in for a reading is written as one
+    # values that replace faulty readings are not written as readings
     columns: dict[str, Sequence[Array]] = {}
     if record.is_measured:
         with naming(str(args.model)):
@@ -81,7 +81,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         lost = sum(x.record.n - x.errors.n for x in runs.values())
         if lost and args.out is not None:
             console.say(f'  {lost} readings are left out: y is nan there in {args.out}')
-        # without faulty samples
+        # the record of the run lacks the faulty samples
         record = runs['y'].record if isinstance(run, FreeRun) else record
         pieces = {axis: x.pieces for axis, x in runs.items()}
         for axis, x in runs.items():
@@ -127,7 +127,7 @@ def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], pa
 
 
 def print_run(run: FreeRun | EachAxis[FreeRun], console: Console) -> dict[str, Any]:
-    """Print the errors of a free run, of each axis where there are several, and return them."""
+    """Print the errors of a free run, for each axis; return them for JSON."""
     if not isinstance(run, EachAxis):
         print_errors(run, console)
         return error_data(run)
@@ -138,7 +138,7 @@ def print_run(run: FreeRun | EachAxis[FreeRun], console: Console) -> dict[str, A
 
 
 def print_errors(run: FreeRun, console: Console) -> None:
-    """Print the errors of a free run, and what it warns of."""
+    """Print the errors and warnings of a free run."""
     rows = [('whole record', run.errors)]
     if any(run.estimated):
         if run.errors_after_start is None:
@@ -163,7 +163,7 @@ def print_errors(run: FreeRun, console: Console) -> None:
 
 
 def error_data(run: FreeRun) -> dict[str, Any]:
-    """Return the errors of a free run for programs."""
+    """Return the errors of a free run for JSON."""
 
     def row(errors: FreeRunErrors) -> dict[str, Any]:
         return {
@@ -232,7 +232,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
 
 
 def _told(drive: Inverse, rate: float) -> dict[str, Any]:
-    """Return what there is to tell of a voltage, for programs."""
+    """Return the figures of an inversion for JSON."""
     return {
         'percent_of_stroke': drive.error,
         'expected_percent_of_stroke': drive.expected,
@@ -246,7 +246,7 @@ def _told(drive: Inverse, rate: float) -> dict[str, Any]:
 
 
 def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:
-    """Return a reference that is one piece at the rate of the model, or refuse it."""
+    """Return the piece of a reference; refuse several pieces, or a rate other than the model's."""
     (piece, *more) = reference
     if more:
         met = '; '.join(str(fault) for fault in reference.faults if not fault.is_note)

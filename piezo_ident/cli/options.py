@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The options of all verbs, each in one list; nothing heavy is imported here.
+Declare the options of all verbs in lists, without heavy imports.
 
-A new way to read records is one line of `READING`, under the name of a field of `ReadOptions`:
-every verb that reads records then has it.
+A new way to read records is one line of `READING` under the name of a field of `ReadOptions`.
+Every verb that reads records then has this option.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from piezo_ident.record.options import parse_columns, scaled_unit, UNITS
 
 
 def _name(text: str) -> str:
-    # an empty shell variable; as a path it would be the working folder
+    # an empty shell variable, which as a path would mean the working folder
     if not text.strip():
         raise click.BadParameter(f'{text!r} is empty; give a name, or leave it out')
     if text.startswith('--'):
@@ -75,7 +75,7 @@ def _limits(ctx: Any, param: Any, limits: tuple[float, float] | None) -> Any:
 
 
 def _among(known: Callable[[], Iterable[str]]) -> dict[str, Any]:
-    """Return the completion of a name: from the known names, or else from files."""
+    """Complete a name from the known names, or else from files."""
 
     def complete(ctx: Any, param: Any, start: str) -> list[CompletionItem]:
         names = [CompletionItem(x) for x in known() if x.startswith(start)]
@@ -91,7 +91,7 @@ def _effects() -> Iterable[str]:
 
 
 def _option(name: str, kind: Any, metavar: str | None, text: str, **more: Any) -> click.Option:
-    # absent is None, so that defaults have one place
+    # an absent option is None, so that the settings alone hold the defaults
     more = {**(_among(tuple) if kind is _file else {}), **more}
     return click.Option([name], type=kind, metavar=metavar, help=text, **more)
 
@@ -131,7 +131,7 @@ RECORD, RECORDS = (
 )
 EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effects))
 
-#: how records are read: fields of `ReadOptions`, whose defaults hold where an option is absent
+#: options for reading records: fields of `ReadOptions`, which holds their defaults
 READING = [
     _option(
         *('--columns', str, 't=NAME,...'),
@@ -187,14 +187,14 @@ EXPORT = [
     OVERWRITE,
 ]
 
-#: how a wanted motion is read
+#: options for reading a wanted motion
 MOTION = [
     option
     for option in READING
     if option.name in ('columns', 'rate', 'time_unit', 'displacement_unit')
 ]
 
-#: what a voltage keeps
+#: limits of a voltage
 KEPT = [
     _option(
         *('--limits', float, 'LO HI', 'Of the voltage [V] (default: the identified range).'),

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``simulate`` and ``convert``: the verbs that write records."""
+"""``simulate`` and ``convert``: write records."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     with deferred_interrupts():
         if args.voltage_only:
             columns = {'t': piece.t, 'v': piece.v, **piece.channels}
-            # who adds what was measured has a labelled record
+            # with the labels: a measured column added later makes a labelled record
             record_io.write_columns(out, lambda: iter([columns]), *labels_of(record))
         else:
             losses = record_io.write(
@@ -119,14 +119,14 @@ def _refuse_unused(args: SimpleNamespace) -> None:
 
 def _write_program(out: Path, program: Program, axes: int, console: Console) -> None:
     text = program_to_yaml(program)
-    every = build_axes(program, axes)  # what the graph would refuse is refused here
+    every = build_axes(program, axes)  # refuses a program that the graph would refuse
     sequence = every[0]
     write_text(out, text)
     console.say(f'{out}: a program of {sequence.duration:.4g} s at {sequence.sample_rate:g} Hz')
     largest = max(float(np.abs(np.diff(q.v)).max(initial=0.0)) for q in every)
     steepest = largest * sequence.sample_rate
     shown = f'{steepest:.6g}'
-    if float(shown) < (1.0 - 1e-9) * steepest:  # of a slew that is too slow
+    if float(shown) < (1.0 - 1e-9) * steepest:  # rounded down: such a slew would be too slow
         shown = f'{(1.0 + 1e-5) * steepest:.6g}'
     console.say(f'steepest: {shown} V/s; the slew of the stage must be as large')
     console.say(sequence.describe())
@@ -137,7 +137,7 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident convert``."""
     check_apart(args.out, args.record)
     _check_record_output(args)
-    # of an unfinished bag, what is whole
+    # recovers the complete part of an unfinished bag
     (record,) = read_all([args.record], args, console, recover=True)
     with deferred_interrupts():
         losses = record_io.write(record, args.out, overwrite=args.overwrite, storage=args.storage)

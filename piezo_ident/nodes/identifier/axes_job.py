@@ -73,7 +73,7 @@ def _report(found: AxesIdentification, warnings: tuple[str, ...]) -> dict[str, o
 
 
 def _known(error: float) -> float | None:
-    """Return an error, or None for the infinite error of a diverging model: JSON has no infinity."""
+    """Return an error, or None if a model diverges: JSON cannot hold infinity."""
     return error if isfinite(error) else None
 
 

@@ -55,7 +55,8 @@ class Worker:
         progress : callable
             Called with the step and its share done, at most every `EVERY`, in another thread.
         ended : callable
-            Called with the result and the error, one of which is None, in another thread.
+            Called with the result and None, or in case of an error with None and the error, in
+            another thread.
         """
         if self.is_busy:
             raise PiezoIdentError('another job runs; wait for its end or cancel it')
