@@ -239,7 +239,7 @@ def check_link(path: Path) -> None:
 
 
 def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None:
-    """Refuse an output that cannot be written; `folder_too` allows a folder, which a bag may be."""
+    """Refuse an output that cannot be written; `folder_too` allows a folder, as for a bag."""
     check_link(path)
     try:
         if path.is_dir() and not folder_too:

@@ -60,7 +60,7 @@ MEMORY = 1.5
 PATIENCE = 6.0 * SLOW
 #: hats over the thresholds (taste: as many as the wider laws of H have)
 HATS = 5
-#: rms size of each change: of weights, of the cubic in normalised units, of the shares of creep
+#: rms size of each change: of weights, of the cubic in normalised units, of the gains of creep
 #: (taste: a third)
 WEIGHTS, CUBIC, CREEP = 0.3, 0.1, 0.3
 #: largest change, in these sizes (taste)

@@ -110,7 +110,7 @@ class Looks:
         self._before, self._now = self._now, time.monotonic()
 
     def is_over(self, since: float, limit: float) -> bool:
-        """Return whether the time from `since` (time.monotonic) exceeds a limit [s]."""
+        """Return whether a wait since a time (time.monotonic) has exceeded a limit [s]."""
         return self._now - since > limit and self._before - since > 0.5 * limit
 
 

@@ -123,7 +123,10 @@ class Predictor:
 
     def process(self, samples: Samples) -> Samples | None:
         """
-        Predict the displacement for a block; None if the block is left out or no model fits it.
+        Predict the displacement for a block.
+
+        The result is None if the block is left out, or if the model is missing or has another
+        rate.
 
         A straight line bridges a gap of up to half a second.  A longer gap and a restart begin a
         new run, with the stage at rest.  Repeated and late blocks, and blocks with NaN or infinite

@@ -9,9 +9,9 @@ where the last block ended, start over, come twice or too late, or belong to ano
 Some middleware does not say which publisher sent a message.  rclpy gives the number that the
 publisher counted for the message, and the ids of all publishers of the topic.  The rules are:
 
-- Every message belongs to the followed publisher while the topic has no other publisher.
-- Later a message belongs to the followed publisher if it carries the next number.  No other
-  publisher may be known to be at that number.  Messages without numbers are compared by time.
+- Every message belongs to the followed publisher while the topic has no other publisher.  - Beside
+other publishers a message belongs to the followed publisher if it carries the next number,
+  and if no other publisher is known to be at that number.  Without numbers the time decides.
 - Two publishers that start together are at the same number and time.  Their messages cannot be
   told apart and are refused.
 - After a silence the followed publisher may come back.  Another publisher is followed once the

@@ -16,8 +16,7 @@ Lags along the path start between the smallest and the largest value that they f
 contribution decays along the path as ``exp(-a_j s)``, so their starts are further numbers of the
 same problem.  A model with creep adds the remaining creep of each element,
 ``c_i d_i exp(-t / tau_i)``.  A shifted zero of the sensor looks like slow creep.  The zero is
-therefore fitted, too, at first.  It is then held at the zero of the model if creep within the
-range explains the record as well.
+therefore fitted, too, unless creep within the range explains the record as well without it.
 """
 
 from __future__ import annotations

@@ -12,24 +12,24 @@ the displacement is the free run plus
 
 - o is an offset, a random walk.
 - d_i is the distance of creep element i from its value in the free run, c_i its share, g = G(1).
-- m is the error of the model.  It is correlated along the path of the voltage, so at rest it
-  stays the same and no averaging over time removes it.
+- m is the error of the model, correlated along the path of the voltage.  At rest m stays the same,
+  so averaging over time does not reduce it.
 
 A Kalman filter follows o, d and m by the means of groups of samples.  `estimate` is the free run
 plus offset and creep, without m: the error of the model must stay visible.
 
-The gain is followed on request.  It adds gamma x, with the free run x about the zero of the model
-and a random walk gamma.  Only motion distinguishes a gain from an offset.  The variance that
-time adds to gamma therefore counts along the path only; at rest gamma stays the same.  The filter
-refuses a step of the gain at first, as it refuses every step.  It accepts the step once the
-voltage has moved and the refused measurements are proportional to x.
+The gain is followed on request.  A changed gain adds gamma x, with the free run x about the zero
+of the model and a random walk gamma.  Only motion distinguishes a gain from an offset.  The
+variance that time adds to gamma therefore counts along the path only; at rest gamma stays the
+same.  The filter refuses a step of the gain at first, as it refuses every step.  The step is
+accepted once the voltage has moved and the refused measurements are proportional to x.
 
 Two hypotheses run side by side, weighted by their likelihood: the zero is unchanged, or it is
 anywhere.  Slow creep and a shifted zero look alike at first.  A wide prior of the zero alone would
 take all creep for a shift.
 
 The unknown output of a play lies between bounds, which the voltage draws together; see
-`MemoryBounds`.  The contribution of these plays is part of the offset.  It may change by as much
+`MemoryBounds`.  The contribution of these plays is part of the offset, which may change by as much
 as their band shrinks.
 
 Kalman filter: R. E. Kalman, "A new approach to linear filtering and prediction problems", J. Basic
@@ -58,8 +58,8 @@ from piezo_ident.record.record import Piece
 HORIZON = 100
 #: time over which displacement is averaged to one measurement [s]
 GROUP = 1e-3
-#: rms error that is assumed for a model without a known error, and smallest assumed error, in
-#: spans: the error of the paper's model, and a tenth of a bit of its converters
+#: assumed rms error of a model without a known error, in spans: the error of the paper's model.
+#: Smallest assumed rms error: a tenth of a bit of its converters
 UNKNOWN, LEAST = 1e-2, 1e-6
 #: path of the voltage over which the error of a model changes, as a share of its range (taste:
 #: the misfit of H has a few waves over a stroke)

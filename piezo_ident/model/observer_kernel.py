@@ -18,14 +18,14 @@ FAINT = -30.0
 #: variance added to the offset when refused measurements are believed, over their mean square:
 #: nine tenths of them count as offset, the rest as error of the model (taste)
 JUMP = 9.0
-#: largest remaining error of refused measurements with a gain, as a share of that with an offset,
-#: for which they count as a gain (taste)
+#: refused measurements count as a gain if a gain leaves at most this share of the squared error
+#: that an offset leaves (taste)
 EXPLAINED = 0.1
 #: largest believable change of the gain, in rms sizes; a larger one is a fault of the sensor
 #: (taste)
 LIKELY = 3.0
-#: path over which the strokes are averaged on which the gain is seen, in correlation lengths of
-#: the error (taste)
+#: path over which mean and variance of the free run are averaged, in correlation lengths of the
+#: error (taste)
 STROKES = 10.0
 
 # places in `State.now`
