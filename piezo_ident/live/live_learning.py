@@ -81,7 +81,7 @@ class LiveLearning:
 
     @property
     def is_done(self) -> bool:
-        """Whether the error has stopped to fall."""
+        """Whether the error has stopped falling."""
         return self._learning.is_done
 
     def take(self) -> None:

@@ -103,7 +103,7 @@ class DrivingNode(LabNode):
         self._counts['samples'] += t.size
 
     def _halt(self, state: str, text: str) -> None:
-        """Ramp to rest, and end in a state."""
+        """Ramp to rest; then report a state with a text."""
         self._end = state, text
         self._begin_ramp()
         self._state = 'stopping'

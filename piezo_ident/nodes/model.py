@@ -82,7 +82,7 @@ class ModelNode(LabNode):
         return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
-        """Take a model file, or another window."""
+        """Apply a model file, a window, or settings of the observer."""
         if path := changed.get('model'):
             self._loader.load_file(path)
         if 'window' in changed:

@@ -122,7 +122,7 @@ class PlayerNode(LabNode):
         Raises
         ------
         PiezoIdentError
-            When there is none.
+            When no replay runs.
         """
         if self._replay is None or not self._is_replaying():
             raise PiezoIdentError('not replaying; call start first')

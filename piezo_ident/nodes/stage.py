@@ -11,9 +11,9 @@ guard has altered the command, so that nothing is lost.
 
 A stage of two axes has own topics for the second axis, such as `voltage_b`, `displacement_b` and
 `applied_voltage_b`, and a guard of its own.  The stream of the first axis rules: a block of
-`voltage` waits up to `PATIENCE` for the block of `voltage_b` with the same t.  A block that does
-not come in time leaves the last voltage of that axis in force.  A second axis without a publisher
-stays at rest.
+`voltage` waits for the block of `voltage_b` with the same t, up to `PATIENCE` or half of
+`silence`.  A block that does not come in time leaves the last voltage of that axis in force.  A
+second axis without a publisher stays at rest.
 
 The stage never starts over.  Like a real stage it keeps its memory from stream to stream, and its
 own clock (for drift and hum) goes on.
@@ -71,7 +71,7 @@ from std_msgs.msg import Float64MultiArray
 
 #: period of the timer that ramps a silent stage [s]
 RAMP_PERIOD = 0.01
-#: longest wait of a block for the block of a further axis [s]
+#: longest wait of a block for the block of a further axis, also limited by half of `silence` [s]
 PATIENCE = 0.2
 #: longest gap in which the voltage is held [s]
 LONGEST_GAP = 10.0

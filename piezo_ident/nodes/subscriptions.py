@@ -72,7 +72,7 @@ def message_class(name: str) -> Any:
     Raises
     ------
     PiezoIdentError
-        When it is not installed.
+        When the package of the type is not installed.
     """
     package, _, kind = name.partition('/msg/')
     try:

@@ -148,8 +148,8 @@ def diagnose(
     model : StageModel or MultiAxisModel
         From `identify`; it may hold effects already.
     records : Record, or sequence of Record
-        Measured data at the sampling rate of the model that its identification did not use.  If
-        they exceed ``settings.most_samples``, the beginnings of the records are searched and
+        Measured data that took no part in the identification, at the sampling rate of the model.
+        If they exceed ``settings.most_samples``, the beginnings of the records are searched and
         fitted, and a warning says how much this is.
     settings : DiagnosisSettings, optional
     progress : callable, optional

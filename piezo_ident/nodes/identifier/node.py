@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The identifier node: subscriptions, services, status, and the jobs of its worker process."""
+"""Identifier node: subscriptions, services, status, and the jobs of its worker process."""
 
 from __future__ import annotations
 
