@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The list of candidates: H and G in each way, with each effect, then with one more.
+List the candidates: each treatment of H and G, with each effect, then with one more effect.
 
-The hysteresis of a piezo is never a sum of plays, and an effect that was there at the
-identification has bent H and G.  So effects are tried beside the H that fits best, and with G
-retuned, too, where that alone leaves clearly less.  What follows the path of the voltage is in any
-H wide enough, so it is tried beside the H as it was given, too.
+The hysteresis of a piezo is never exactly a sum of plays.  An effect that already acted during the
+identification has also distorted the identified H and G.  Effects are therefore tried beside the H
+that fits best.  They are also tried with a retuned G if retuning alone clearly lowers the error.
+A wide enough H can imitate each effect that follows the path of the voltage.  Such effects are
+therefore tried beside the H as given, too.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import TrialColumns
 from piezo_ident.effects import Effect, find_effect
 
-#: share of what the best smaller set leaves that a candidate must promise to be fitted on
+#: a candidate is fitted on only if it may reach this share of the error of the best smaller set
 PROMISING = 0.9
-#: sets to which one more effect is added: of one effect, and of more
+#: number of sets to which one more effect is added: of sets with one effect, and of larger sets
 EXTENDED = 2, 1
-#: sets of each size that are tried in all ways of H and G
+#: number of sets of each size that are tried with all treatments of H and G
 IN_ALL_WAYS = 3
 
 Tick = Callable[[float], None]
@@ -41,8 +42,9 @@ class CandidateSearch:
     """
     Fits the candidates of some data.
 
-    `lines` are those in the residual [Hz], `noise` is the mean square of the noise of a row,
-    `missed` what G may miss (`Candidates.missed`), `effects` are the names that may be added.
+    `lines` are the frequencies of lines in the residual [Hz], `noise` is the mean square of the
+    noise of a row, `missed` is the possible error of G (`Candidates.missed`), and `effects` names
+    the effects that may be added.
     """
 
     def __init__(
@@ -61,21 +63,22 @@ class CandidateSearch:
         self._lines = lines
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
-        # a known effect of the path that has changed since would look like another one
+        # a change of a known effect of the path would look like another such effect
         self._effects = [
             effect
             for effect in map(find_effect, effects)
             if not (knows_path and effect.rate_independent)
         ]
         self._count = 0
-        #: all searches that were made
+        #: all searches so far
         self.rounds: list[Round] = []
 
     def shown(self, fitted: Fitted, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
         """
-        Return a fit with the effects that tests of their own have shown, and their names.
+        Add each effect that a test of its own has shown, and return the fit and their names.
 
-        They must be as large as any effect, and no side effect of one another's form.
+        Each such effect must lower the mean square by at least `SMALLEST_EFFECT`, beside the
+        effects added before it.
         """
         least = self._simulator.rows.square(SMALLEST_EFFECT)
         found = list[str]()
@@ -87,7 +90,7 @@ class CandidateSearch:
         return fitted, tuple(found)
 
     def of(self, plays: Fitted, wide: Fitted, most: int) -> Candidates:
-        """Return all candidates with up to `most` effects beside those of two refits."""
+        """Fit all candidates with up to `most` effects beside the effects of two refits."""
         candidates = self._ways(plays, wide)
         least = min(map(candidates.left, candidates.all))
         path = [effect for effect in self._effects if effect.rate_independent]
@@ -95,7 +98,7 @@ class CandidateSearch:
         for base in _worth_searching(candidates):
             some, goal = self._effects, PROMISING * least
             if base is not best and not base.retunes:
-                # it need do most of what a refit does
+                # the effect must do most of the work of a refit
                 some, goal = path, least + TAKES * max(candidates.left(base) - least, 0.0)
             candidates = candidates.and_these(self._with_each(base, some, goal))
         candidates = self._in_all_ways(candidates, 1)
@@ -112,10 +115,10 @@ class CandidateSearch:
 
     def _in_all_ways(self, candidates: Candidates, size: int) -> Candidates:
         """
-        Return the candidates with the best sets of a size in all ways of H and G.
+        Fit the best sets of a size with all treatments of H and G.
 
-        What a wide H made up for an effect is in its way under other motion, and what effects and
-        plays leave together need not be the like of another effect.
+        A wide H may have absorbed an effect in part, and this H then errs under other motion.  A
+        sum of plays may leave an error that another effect fits by accident.
         """
         sets = [s for s in candidates.sets if len(s) == size]
         laws = {c.way: law_of(c.fitted) for c in candidates.of(()) if c.way != 'given'}
@@ -123,7 +126,7 @@ class CandidateSearch:
             best = candidates.of(effects)[0]
             have = {c.way for c in candidates.of(effects)}
             state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
-            # a way that leaves more than the best one does not count
+            # a treatment with a larger error than the best treatment does not count
             goal = np.inf if effects == sets[0] else self._noise + candidates.left(best)
             more = []
             if 'given' not in have:
@@ -143,7 +146,7 @@ class CandidateSearch:
         return candidates
 
     def _ways(self, plays: Fitted, wide: Fitted) -> Candidates:
-        """Return the candidates without an effect, but for those of the refits."""
+        """Fit the candidates without an effect, except for the effects of the refits."""
         simulator = self._simulator
         state = replace(self._given, effects=wide.state.effects)
         given = fit_jointly(simulator, state, base_at(simulator, state))
@@ -158,7 +161,7 @@ class CandidateSearch:
     def _with_each(
         self, base: Candidate, some: Sequence[type[Effect]], goal: float
     ) -> list[Candidate]:
-        """Return candidates with one more effect, of which each promises to leave so much."""
+        """Fit candidates with one more effect; each must promise an error below `goal`."""
         effects = [
             effect
             for effect in some
@@ -168,19 +171,19 @@ class CandidateSearch:
         self.rounds.append(this)
         return [
             Candidate(tuple(sorted((*base.effects, fitted.name))), base.way, fitted, this)
-            # only beside the effect that was missing does what creeps on from before show
+            # creep from earlier motion shows only beside the effect that was missing
             for fitted in (with_earlier_motion(self._simulator, one) for one in this.contenders)
         ]
 
     def _worth_extending(self, candidates: Candidates, size: int) -> list[Candidate]:
-        """Return the bests of a size to which one more effect is added."""
+        """Return the best sets of a size to which one more effect is added."""
         sets = [s for s in candidates.sets if len(s) == size]
         bests = [c for c in map(candidates.best, sets) if c is not None]
         if not bests:
             return []
         least = candidates.left(bests[0])
-        # no law of a candidate is quite that of a stage: what is little beside the first effect
-        # may be the rest of it
+        # no law of a candidate fits a stage exactly: a small error beside the first effect may
+        # belong to that effect
         whole = candidates.left(candidates.without(bests[0].effects))
         enough = candidates.least_share + self._simulator.rows.square(SMALLEST_EFFECT)
         if least < max(enough, LITTLE * whole):
@@ -195,7 +198,7 @@ class CandidateSearch:
         done, self._count = self._count, self._count + 1
 
         def tick(share: float) -> None:
-            # most searches end after three or four rounds: the bar nears its end ever slower
+            # most searches end after three or four rounds, so the bar slows down towards its end
             self._tick(1.0 - 0.6 ** (done + share))
 
         return search_round(
@@ -211,15 +214,15 @@ class CandidateSearch:
 
 
 def _best_h(candidates: Candidates) -> Candidate:
-    """Return the H that leaves least with the G as it is."""
+    """Return the candidate with the H that leaves the smallest error with an unchanged G."""
     return min((c for c in candidates.all if not c.retunes), key=candidates.left)
 
 
 def _worth_searching(candidates: Candidates) -> list[Candidate]:
     """
-    Return the ways beside which effects are sought: the H as given, and the one that fits best.
+    Return the candidates beside which effects are sought: the given H and the best H.
 
-    That with a retuned G, too, where it leaves clearly less.
+    The best candidate with a retuned G is added if its error is clearly smaller.
     """
     best = _best_h(candidates)
     retuned = sorted((c for c in candidates.all if c.retunes), key=candidates.left)

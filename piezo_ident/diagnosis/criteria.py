@@ -2,53 +2,57 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The constants that decide a verdict, and where each comes from.
+Constants that decide a verdict, with the source of each.
 
-Physics: it follows from how stages, sensors and the candidates' laws behave.
-Statistics: it follows from a test or from how well a quantity can be estimated.
+Physics: the constant follows from the behaviour of stages, of sensors and of the candidates' laws.
+Statistics: the constant follows from a test, or from the accuracy of an estimate.
 Taste: another choice would be defensible.
 
-Shares and ratios are of mean squares beyond the noise, sizes are rms in % of stroke.
+Shares and ratios compare mean squares beyond the noise.  Sizes are rms in % of stroke.
 """
 
 from __future__ import annotations
 
 # -- physics -------------------------------------------------------------------------------------
 
-#: size below which nothing is named: real laws differ from textbook ones by about as much
+#: smallest size of an effect that is named: real laws differ from textbook laws by about as much
 SMALLEST_EFFECT = 0.05
-#: share of what G missed when it was identified, times the fast motion now over that of then, that
-#: a change of G must exceed: what it missed was partly small loops, which no G holds
+#: a change of G must exceed this share of the error of G at its identification, scaled by the
+#: ratio of the fast motion now to the fast motion then: part of that error was small loops, not G
 IN_PROPORTION = 0.5
-#: times the rest that the mean error of a record is, where the zero of the sensor has moved
+#: the zero of the sensor has moved if the mean error of a record is so many times the other error
 MOVED_ZERO = 3.0
 
 # -- statistics ----------------------------------------------------------------------------------
 
 #: passes over the voltage range that held-out data need: a branch passed once has no second half
 PASSES = 3.0
-#: ratio of a gain to the largest gain on circular-shift surrogates that makes it significant:
-#: their largest is exceeded by chance in 1 of 17 cases, the factor allows for the many candidates
+#: a gain is significant if it exceeds the largest gain on circular-shift surrogates by this
+#: factor: chance exceeds the largest gain in 1 of 17 cases, and the factor allows for many
+#: candidates
 BEYOND_CHANCE = 1.5
-#: standard errors over held-out blocks from which a difference is one (95 % of a normal variable)
+#: a difference is significant from so many standard errors over held-out blocks (95 % of a normal
+#: variable)
 STANDARD_ERRORS = 2.0
-#: factor of an effect where it alone acts, as fitted to all data: 1 is exact
+#: accepted range of the factor of an effect in the place where it alone acts; 1 is exact
 SHOWS = (0.4, 3.0)
-#: share of a candidate's columns outside the span of the base below which it is not testable:
-#: its amplitude is then known a hundred times less well
+#: a candidate is not testable if a smaller share of its columns lies outside the span of the base:
+#: its amplitude is then known a hundred times less accurately
 SWALLOWED = 1e-4
-#: share of the noise that counts as left: its mean square is known to about as much
+#: share of the mean square of the noise that is always added to the error: the noise is known to
+#: about this share
 NOISE_SHARE = 0.1
 
 # -- taste ---------------------------------------------------------------------------------------
 
-#: share that an effect, or a wider H, may leave: it takes most
+#: an effect, or a wider H, explains most of an error if it leaves at most this share
 TAKES = 0.4
-#: times the least that candidates leave which are alike: the one with fewest parameters is taken
+#: candidates with errors up to this factor times the smallest error are equal, and the candidate
+#: with the fewest parameters is taken
 ALIKE = 1.3
-#: times what the best leaves, of candidates that are not separated from it
+#: candidates with errors up to this factor times the best error are not separated from the best
 RIVALS = 1.6
-#: share of what there was to explain that may be left by what explains it
+#: an explanation may leave this share of the error to explain
 LITTLE = 0.1
-#: most names of a class
+#: largest number of names of a class
 CLASS_SIZE = 3

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What creeps on from motion before a record.
+Fit creep that continues from motion before a record.
 
-A stage that has moved creeps for minutes, so the elements of creep are hardly at rest when a
-record begins.  What each of them still has to go adds ``d_i exp(-t / tau_i)`` to the displacement:
-a few numbers of each record, in which the prediction is linear.
+A stage creeps for minutes after a motion, so creep has rarely settled at the start of a record.
+The remaining creep of each element adds ``d_i exp(-t / tau_i)`` to the displacement.  The
+prediction is linear in these amplitudes, a few numbers for each record.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
 
-#: share of the rms error of held-out blocks that may be left with what creeps on from before
+#: share of the rms error of held-out blocks that may remain with earlier creep
 EARLIER_LEAVES = 0.5
 
 
@@ -37,11 +37,11 @@ def with_earlier_motion(
     simulator: Simulator, fitted: Fitted, tick: Callable[[], None] = lambda: None
 ) -> Fitted:
     """
-    Return a fit in which creep goes on from before each record.
+    Return the fit, with creep from earlier motion if that helps clearly.
 
-    Without creep, found or in the model, nothing does.  It must predict held-out blocks clearly
-    better, and be no more than earlier motion can leave.  `tick` is called between the steps of a
-    fit.
+    A fit or model without creep stays unchanged.  The earlier creep must lower the error on
+    held-out blocks to `EARLIER_LEAVES` of it.  Its size must be possible after motion within the
+    range.  `tick` is called between the steps of a fit.
     """
     state = fitted.state
     creep = _creep_of(simulator, state)
@@ -56,14 +56,14 @@ def with_earlier_motion(
         fitted = _settled(simulator, state, tick)
         crept = _settled(simulator, start, tick)
     except IdentificationError:
-        # what cannot be fitted is not there
+        # the fit fails, so the data do not hold this creep
         return fitted
     is_better = crept.mean_square <= EARLIER_LEAVES**2 * fitted.mean_square
     return crept if is_better and _is_possible(simulator, crept.state) else fitted
 
 
 def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
-    """Return whether a first step towards decays gains half of what they must gain."""
+    """Return whether a first linear step gains at least half of the required gain."""
     rows, E, M = simulator.rows, fitted.e[:, None], fitted.J
     C = simulator.added_columns(start)[:, start.offsets.size :]
     both = with_columns(rows, normal_equations(rows, M, E), M, C, E)
@@ -73,7 +73,7 @@ def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
 
 
 def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any]:
-    """Return the parameters of creep in a state or else in its model; nothing without creep."""
+    """Return the parameters of creep in a state, or in its model; empty without creep."""
     found = [added.values[0] for added in state.effects if added.name == CREEP]
     found += [x.parameters for x in simulator.model.effects if x.name == CREEP]
     return found[0] if found else {}
@@ -81,14 +81,14 @@ def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any]:
 
 def _is_possible(simulator: Simulator, state: State) -> bool:
     """
-    Return whether creep can have left as much as a record begins with.
+    Return whether creep can have caused the displacements at the start of each record.
 
-    Each element has followed voltages of the range.  A record that begins at the lowest one sinks
-    at first; a drift may rise, and by more.
+    The earlier voltage of each element stayed within the range.  A record that begins at the
+    lowest voltage can therefore only sink through creep.  A drift may rise, and may be larger.
     """
     rows, values = simulator.rows, _creep_of(simulator, state)
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
-    # faster elements make up for dynamics
+    # faster elements compensate for dynamics
     gain = float(gains[times > AT_ONCE].sum())
     doubt = np.sqrt(rows.square(SMALLEST_EFFECT))
     starts = {k: run.u[0] for run, k in reversed([*zip(rows.runs, rows.record, strict=True)])}
@@ -98,6 +98,6 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
 
 
 def _settled(simulator: Simulator, state: State, tick: Callable[[], None]) -> Fitted:
-    """Return a fit to its end."""
+    """Fit a state until fresh columns of H gain nothing more."""
     fitted = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
     return with_fresh_columns(simulator, fitted, tick)

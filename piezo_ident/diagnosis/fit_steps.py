@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The steps of a joint fit: their equations and their damping.
+Compute the steps of a joint fit: normal equations and damping.
 
-Gauss-Newton steps with the damping of Levenberg and Marquardt, which follows how much of what a
-step promised came true: D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
+The steps are Gauss-Newton steps with the damping of Levenberg and Marquardt.  The damping follows
+the ratio of the actual gain of a step to its predicted gain: D.  W.  Marquardt, J.  Soc.  Indust.
+Appl.  Math.  11(2), 1963, pp.  431-441,
 doi:10.1137/0111030.
 """
 
@@ -20,13 +21,13 @@ from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import centred, Rows
 from piezo_ident.fitting.equations import bounded_step
 
-#: factor of the damping after a step that failed; its square after the next one, and so on
+#: factor of the damping after a failed step; each further failure squares the factor
 WORSE = 3.0
-#: shares of what a step promised: above the first damping falls, below the second it grows
+#: ratios of actual to predicted gain: above the first the damping falls, below the second it grows
 KEPT = (0.75, 0.25)
-#: factors of H beyond which something else is the matter
+#: accepted range of the factor of H; a factor outside of it has another cause
 SCALES = (0.2, 5.0)
-#: share of H that must not be like what only adds to it
+#: smallest share of the energy of H that additive columns must leave for the factor to be computed
 SEEN = 0.01
 
 
@@ -35,8 +36,9 @@ class BaseColumns:
     """
     Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
 
-    They are those of the law of H behind G, and the offset of each record; the products are those
-    of each block, shape (blocks, p, p), and of all.
+    The columns belong to the coefficients of H, filtered through G, and to the offset of each
+    record.  `products` holds the products of each block, shape (blocks, p, p), and `total` their
+    sum.
     """
 
     columns: Array
@@ -45,18 +47,18 @@ class BaseColumns:
 
     @classmethod
     def of(cls, rows: Rows, columns: Array) -> BaseColumns:
-        """Return columns with their products."""
+        """Compute the products of columns."""
         products = block_products(rows, columns, columns)
         return cls(columns, products, products.sum(axis=0))
 
 
 class Scale:
     """
-    How much larger H comes out of the chain than its columns tell.
+    Ratio of H at the output of the chain to H as its columns predict it.
 
-    What is behind H multiplies it: creep, a gain, and what the columns left out of both.  A step
-    of both is no sum of the two, and without the product a fit takes many small steps.  What only
-    adds to the signal, the columns `aside` of shape (n, k), is no scale.
+    Links behind H multiply H: creep, a gain, and parts that the columns omit.  A joint step of H
+    and such a link contains a product.  Without this product a fit takes many small steps.  The
+    columns `aside`, shape (n, k), only add to the signal, so they do not change the ratio.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class Scale:
         self._is_seen = self._size > SEEN * float(h @ h)
 
     def of(self, change: Array) -> float:
-        """Return the factor once the rows have changed, shape (n,)."""
+        """Return the ratio after a change of the rows, shape (n,)."""
         if not self._is_seen:
             return 1.0
         factor = float((self._x + change) @ self._across) / self._size
@@ -80,7 +82,7 @@ class Scale:
 
 
 class FitStep:
-    """Normal equations of a step."""
+    """Normal equations of one step."""
 
     def __init__(
         self, base: BaseColumns, moving: Array, e: Array, prior: Array, pull: Pull | None = None
@@ -93,23 +95,23 @@ class FitStep:
         self._A, self._b, self._prior = A, b, prior
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
-        """Return the bounded step; damping is a share of each column's own energy."""
+        """Compute the bounded step; `damping` is a share of the energy of each column."""
         return bounded_step(self._A, self._b, lower, upper, prior=self._prior, damping=damping)
 
     def gain(self, delta: Array) -> float:
-        """Return by how much a step lowers the sum of squares, were the model linear."""
+        """Predict the decrease of the sum of squares by a step of a linear model."""
         return float(delta @ (2.0 * self._b - self._A @ delta))
 
 
 def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:
-    """Return the products of moving and e, side by side, with the columns and with themselves."""
+    """Multiply ``[moving, e]`` by the columns and by itself."""
 
     def of(part: slice) -> tuple[Array, Array]:
-        # one pass over the many columns
+        # one pass over the many columns saves time
         own = np.concatenate([moving[part].T, e[None, part]]).T
         return columns[part].T @ own, own.T @ own
 
-    # the command line and the nodes keep BLAS to one thread
+    # two threads, as the command line and the nodes keep BLAS to one thread
     half = e.size // 2
     with ThreadPoolExecutor(2) as pool:
         first, second = pool.map(of, (slice(half), slice(half, None)))
@@ -117,7 +119,7 @@ def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:
 
 
 def next_damping(kept: float) -> float:
-    """Return the factor of the damping after a step that kept a share of what it promised."""
+    """Return the factor of the damping for a ratio of actual to predicted gain."""
     if kept > KEPT[0]:
         return 0.1
     return 1.0 if kept > KEPT[1] else WORSE

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What G missed when it was identified: no smaller change of the dynamics can be told."""
+"""Error of G at its identification; a smaller change of the dynamics cannot be detected."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from piezo_ident.model.stage_model import StageModel
 
 
 def missed_then(model: StageModel) -> float:
-    """Return what the model missed at its identification, % of stroke, or 0: of fast motion."""
+    """Return the error of the model on fast motion at its identification, % of stroke; else 0."""
     known = _entries(model, 'errors')
     if 'fast_motion' in known:
         known = {'fast_motion': known['fast_motion']}
-    # a file without that tells the error of all motion at least
+    # an older file only holds the error on all motion
     return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
 
 
 def missed_now(simulator: Simulator) -> float:
     """
-    Return what G may miss of the motion in these data, % of stroke.
+    Estimate the error of G on the motion in these data, % of stroke.
 
-    What it misses grows with the motion.  Part of what it missed then is none of G, such as small
-    loops that open less than H says, so only a share counts of what the proportion gives.
+    The error of G grows with fast motion.  Part of the known error does not belong to G, such as
+    small loops that open less than H predicts.  Only the share `IN_PROPORTION` of the proportional
+    growth therefore counts.
     """
     model = simulator.model
     then = _entries(model, 'fast_displacement').get('percent_of_stroke')

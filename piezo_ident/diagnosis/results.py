@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a diagnosis is asked for, and what it gives back."""
+"""Settings and results of a diagnosis."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ FORMULA = (
 @dataclass(frozen=True)
 class DiagnosisSettings:
     """
-    How to diagnose.
+    Settings of a diagnosis.
 
     Attributes
     ----------
     effects : tuple of str, optional
-        Candidates; the whole catalogue when absent.
+        Candidates; by default the whole catalogue.
     without : tuple of str
         Candidates to leave out.
     most_effects : int
-        Effects that are added at most.
+        Largest number of effects that are added.
     most_samples : int
-        Samples that are searched and fitted at most, the beginnings of the records: 0.9 to
-        1.3 kB each.
+        Largest number of samples that are searched and fitted, from the beginnings of the records.
+        A sample needs 0.9 to 1.3 kB of memory.
     seed : int
-        For everything that is drawn by chance.
+        Seed of all random numbers.
 
     Raises
     ------
     ConfigError
-        When a name is not in the catalogue, or a number out of range.
+        If a name is not in the catalogue, or a number is out of range.
 
     Examples
     --------
@@ -75,7 +75,7 @@ class DiagnosisSettings:
 
 @dataclass(frozen=True)
 class FoundParameter:
-    """A fitted parameter: value, unit, and standard deviation where there is one."""
+    """Fitted parameter: value, unit, and its standard deviation if it is known."""
 
     value: float | str | tuple[float, ...]
     unit: str
@@ -85,10 +85,10 @@ class FoundParameter:
 @dataclass(frozen=True, eq=False)
 class FoundEffect:
     """
-    An effect that was added to the model, in one of the slots of its chain.
+    Effect that was added to the model, in one of the slots of its chain.
 
-    It explains a `share` (0 .. 1) of the explainable part of the residual, of `rms_percent` % of
-    stroke.
+    `share` (0 ..  1) is the part of the explainable error that the effect removes, and
+    `rms_percent` is the rms of this part in % of stroke.
     """
 
     name: str
@@ -100,7 +100,7 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Class:
-    """Effects that these data cannot tell apart, and the experiment that would."""
+    """Effects that these data cannot separate, and an experiment that separates them."""
 
     names: tuple[str, ...]
     separating_experiment: str
@@ -109,9 +109,9 @@ class Class:
 @dataclass(frozen=True)
 class OtherGain:
     """
-    Gain of the stage over that of the model, and what it accounts for.
+    Ratio of the gain of the stage to the gain of the model, and the error that it explains.
 
-    Its `share` (0 .. 1) is of what the model as given misses beyond the noise.
+    `share` (0 ..  1) is relative to the error of the model as given beyond the noise.
     """
 
     value: float
@@ -120,7 +120,7 @@ class OtherGain:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A candidate that was not added: its share of the explainable part alone, and why not."""
+    """Candidate that was not added: its share of the explainable error alone, and a reason."""
 
     name: str
     share: float
@@ -129,7 +129,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is left beyond the noise: share of the explainable part, rms [% of stroke], words."""
+    """
+    Error left beyond the noise: share of the explainable error, rms [% of stroke], description.
+    """
 
     share: float
     rms_percent: float
@@ -138,7 +140,7 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class Untestable:
-    """An effect that these data cannot show, and what would."""
+    """Effect that these data cannot show, and the data that would show it."""
 
     name: str
     needs: str
@@ -146,7 +148,7 @@ class Untestable:
 
 @dataclass(frozen=True)
 class Errors:
-    """Free-run errors in % of stroke: overall, by segment label, by a sine's frequency [Hz]."""
+    """Free-run errors [% of stroke]: overall, by segment label, by frequency of a sine [Hz]."""
 
     overall: float
     by_segment: Mapping[str, float]
@@ -162,14 +164,14 @@ class Unseen:
     ----------
     record : str
     before, after : float
-        Of the model as given and of the refined one; of a record that does not start at rest,
-        behind the part from which its start is estimated.
+        Errors of the given and of the refined model.  If the record does not start at rest, its
+        start is estimated from a first part, and the errors exclude this part.
     before_centred, after_centred : float
-        The same without the mean of the error: a sensor may have been set to zero again.
+        The same errors without their mean, as a sensor may have been zeroed again.
     n : int
-        Samples judged.
+        Number of judged samples.
     sines : tuple of (float, float, float)
-        Frequency [Hz] and errors before and after, in steady state.
+        Frequency [Hz] of each sine, and the errors before and after in steady state.
     """
 
     record: str
@@ -186,8 +188,8 @@ class Residual:
     """
     One piece with its residuals, measured minus predicted [m], shape (n,).
 
-    By the model as given, by the base model refitted (`before`), and by the refined model; the
-    samples of `sound` count.
+    `given` is the residual of the model as given, `before` of the refitted base model, and `after`
+    of the refined model.  `sound` marks the samples that count.
     """
 
     record: str
@@ -207,22 +209,23 @@ class Diagnosis(Showable):
     ----------
     verdict : {'named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none'}
     sentence : str
-        The verdict for a reader.
+        The verdict in words.
     given, model : StageModel
-        The model that was judged, and the refined one; the same where it stays as given.
+        The judged model and the refined model; the same model if it stays as given.
     effects : tuple of FoundEffect
-        In the order in which they were found.
+        Effects that were added, in the order of the search.
     group : Class or None
-        Effects that these data cannot tell apart; where none was found, those that may hide in
-        the H that was refitted.
+        Effects that these data cannot separate.  If no effect was added, the group holds effects
+        that may hide in the refitted H.
     unexplained : Unexplained
     candidates : tuple of Candidate
         Best first.
     before, refit, after : Errors
-        Of the model as given; of the base model refitted, blocks held out; of the refined model,
-        kinds of motion held out as a whole; what follows time counts as it was found in these
-        records, and H as refitted with it, though the model leaves both out where there is
-        nothing else.
+        Errors of three models.  `before`: the model as given.  `refit`: the refitted base model,
+        on held-out blocks.  `after`: the refined model, on whole held-out kinds of motion.  An
+        effect that depends on time counts in `after` with its parameters in these records, and so
+        does the H refitted with it, although the refined model omits such an effect and this H if
+        nothing else was found.
     noise_floor : float or None
         Rms of single samples, % of stroke.
     noise_source : str
@@ -233,23 +236,23 @@ class Diagnosis(Showable):
     residuals : tuple of Residual
     records : tuple of str
     blocks : int
-        How many blocks were held out in turn.
+        Number of blocks that were held out in turn.
     warnings : tuple of str
     settings : DiagnosisSettings
     unseen : tuple of Unseen
         Errors on records that took no part.
     law : str
-        That of H as it was fitted, of `piezo_ident.operators.hysteresis_law.LAWS`; empty where it
-        stays as it was given.
+        Law of the fitted H, a name of `piezo_ident.operators.hysteresis_law.LAWS`; empty if H
+        stays as given.
     errors_of_laws : mapping of str to float
-        Of H refitted as plays and as wider laws, on kinds of motion held out, % of stroke.
+        Errors of H refitted as plays and as wider laws, on held-out kinds of motion, % of stroke.
     kinds : tuple of str
-        Kinds of motion held out in turn; empty where parts of the data stood for them.
+        Kinds of motion that were held out in turn; empty if parts of the data replaced them.
     gain : OtherGain or None
-        Where another gain does what a refit of H does.
+        The other gain, if it explains the error as well as a refit of H.
     set_in : bool
-        Whether an effect has set in since the identification, so that shares are of what the model
-        misses as it was given; else they are of what the H that fits best leaves.
+        Whether an effect has appeared since the identification.  If so, shares are relative to the
+        error of the model as given; otherwise to the error of the best H.
     outside : float
         Share of the samples whose voltage lies outside the range of the given model.
 
@@ -296,14 +299,16 @@ class Diagnosis(Showable):
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """How the refined model differs from the given one; empty where it stays as given."""
+        """
+        Changes from the given to the refined model, in words; empty if the model stays as given.
+        """
         return changes(self.given, self.model)
 
 
 def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
-    """Return how a refined model differs from the one that it came from; empty if not at all."""
+    """List the changes from a given to a refined model in words; empty if there are none."""
     texts = []
-    # a play without weight is none
+    # a play without weight has no effect
     old, new = (m.hysteresis.without_idle().numbers for m in (given, refined))
     if not np.array_equal(old, new):
         texts.append('H refitted')

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-G, creep in front of it and a short delay, of which only the means of rows are wanted.
+Filter through G, creep in front of G and a short delay, and compute means of rows only.
 
-Most of what a fit asks of G is means of some samples in a row.  The state of G then steps from
-one group of rows to the next, and what the samples in between add is a product of matrices: that
-takes about half the time of a filter that makes every sample.  Such a system is called lifted; see
-P. P. Khargonekar, K. Poolla and A. Tannenbaum, IEEE Trans. Autom. Control 30(11), 1985,
-pp. 1088-1096, doi:10.1109/TAC.1985.1103841.
+A fit mostly needs means of the output of G over rows of some samples.  The state of G therefore
+steps from one group of rows to the next.  A product of matrices adds the contribution of the
+samples in between.  This takes about half the time of a filter that computes every sample.  Such a
+system is called lifted; see P.  P.  Khargonekar, K.  Poolla and A.  Tannenbaum, IEEE Trans.
+Autom.  Control 30(11), 1985, pp.  1088-1096, doi:10.1109/TAC.1985.1103841.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.sections import rounding_of
 from scipy.linalg import block_diag
 
-#: samples in a row and in a run from which it is quicker than G itself
+#: fewest samples in a row, and in a run, for which the row filter is quicker than G itself
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000
-#: samples in a group of rows, about
+#: approximate number of samples in a group of rows
 IN_GROUP = 48
-#: share of the output that eq. (5) may lose by rounding: powers of A lose far more
+#: largest share of the output that eq.  (5) may lose by rounding: powers of A lose far more
 LOST = 1e-12
 
 
 def group_of(m: int) -> int:
-    """Return the rows in a group, for m samples in a row."""
+    """Return the number of rows in a group, for m samples in a row."""
     return max(1, IN_GROUP // m)
 
 
 def serves(parts: Sequence[Dynamics | Array], m: int, samples: int) -> bool:
-    """Return whether filters one behind the other may be run as rows, and are quicker so."""
+    """Return whether a row filter can run the filters in series, and is quicker."""
     own = [part for part in parts if isinstance(part, Dynamics)]
     is_quick = bool(own) and m >= LEAST_IN_ROW and samples >= LEAST_IN_RUN
     return is_quick and all(G.sections is not None or rounding_of(G.a) < LOST for G in own)
@@ -45,9 +45,9 @@ def serves(parts: Sequence[Dynamics | Array], m: int, samples: int) -> bool:
 
 class _Form(NamedTuple):
     """
-    ``s(k+1) = A s(k) + B w(k)`` and ``y(k) = C s(k) + D w(k)``.
+    State-space form ``s(k+1) = A s(k) + B w(k)`` and ``y(k) = C s(k) + D w(k)``.
 
-    Under w = 1 it rests with s = `rest` and y = `gain`.
+    Under w = 1 the state at rest is `rest` and the output is `gain`.
     """
 
     A: Array
@@ -65,8 +65,9 @@ class RowFilter:
     Parameters
     ----------
     parts : sequence of Dynamics or of ndarray, shape (k, 5)
-        Filters one behind the other; as one of their order they would lose digits.  An array holds
-        b_0, b_1, b_2, a_1 and a_2 of filters whose outputs are added to the signal.
+        Filters in series.  They stay apart because a single filter of the total order would lose
+        digits.  An array holds b_0, b_1, b_2, a_1 and a_2 of filters whose outputs are added to
+        the signal.
     m : int
         Samples in a row.
 
@@ -87,7 +88,8 @@ class RowFilter:
         size = B.size
         self._m, self._group = m, group_of(m)
         length = self._group * m
-        # state and output after each sample, of the state before and of every input
+        # rows of `outputs` and `direct`: each output from the state before the group, and from
+        # each input
         after, of_inputs = np.eye(size), np.zeros((size, length))
         outputs, direct = np.empty((length, size)), np.zeros((length, length))
         for k in range(length):
@@ -96,13 +98,14 @@ class RowFilter:
             after, of_inputs = A @ after, A @ of_inputs
             of_inputs[:, k] = B
         means = np.kron(np.eye(self._group), np.full(m, 1.0 / m))
-        #: what inputs add to the state and to the means, and what the state before does
+        #: effect of the inputs, and of the state before a group, on the next state and on the
+        #: means
         self._of_inputs = np.concatenate([of_inputs, means @ direct]).T.copy()
         self._of_state = np.concatenate([after, means @ outputs]).T.copy()
         self._s = np.zeros(size)
 
     def reset(self, x: float) -> float:
-        """Come to rest under x, and return what goes out."""
+        """Come to rest under x, and return the output."""
         states = []
         for form in self._forms:
             states.append(x * form.rest)
@@ -112,9 +115,10 @@ class RowFilter:
 
     def process(self, x: Array) -> Array:
         """
-        Return the means of the next rows; shape (n // m,).
+        Compute the means of the next rows; shape (n // m,).
 
-        Unless it is the last, x holds whole groups of rows.  What is not finite spoils its group.
+        x holds whole groups of rows, unless it is the last part.  A value that is not finite
+        spoils its group.
         """
         length = self._group * self._m
         rows, groups = x.size // self._m, -(-x.size // length)
@@ -127,7 +131,7 @@ class RowFilter:
 
 
 def _forms_of(part: Dynamics | Array) -> list[_Form]:
-    """Return a part in the transposed direct form, or its sections one behind the other."""
+    """Return the transposed direct form of a part, or the forms of its sections in series."""
     if not isinstance(part, Dynamics):
         return [_beside_the_signal([_direct(section[3:], section[:3]) for section in part])]
     if part.sections is not None:
@@ -139,7 +143,7 @@ def _forms_of(part: Dynamics | Array) -> list[_Form]:
 
 
 def _direct(a: Array, b: Array) -> _Form:
-    """Return the form of a_1 .. a_n and b_0 .. b_n."""
+    """Return the form with coefficients a_1 .. a_n and b_0 .. b_n."""
     own = np.eye(a.size, k=1)
     own[:, 0] = -a
     gain = float(b.sum() / (1.0 + a.sum()))
@@ -148,7 +152,7 @@ def _direct(a: Array, b: Array) -> _Form:
 
 
 def _beside_the_signal(forms: Sequence[_Form]) -> _Form:
-    """Return the form of a signal with what filters of it make."""
+    """Return the form whose output is the signal plus the outputs of filters of the signal."""
     return _Form(
         block_diag(*(form.A for form in forms)),
         np.concatenate([form.B for form in forms]),

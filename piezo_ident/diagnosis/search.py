@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One round of the search: which candidate lowers the error on data that were not fitted.
+Run one round of the search: find the candidates that lower the error on held-out data.
 
-Every candidate is tried by finite differences of the whole model, the effect switched slightly
-on.  Its columns are scored by what they gain on held-out blocks in addition to all that is in the
-model already, against what chance gains on circular-shift surrogates of the residual.  The most
-promising ones are fitted together with everything else.
+Each candidate is tried by finite differences of the whole model, with the effect switched slightly
+on.  Its score is the gain of its columns on held-out blocks, beside all other columns of the
+model.  The gain is compared with the gain on circular-shift surrogates of the residual, which
+chance alone produces.  The most promising candidates are then fitted together with the rest of the
+model.
 """
 
 from __future__ import annotations
@@ -39,24 +40,27 @@ from piezo_ident.diagnosis.trial_scores import (
 from piezo_ident.effects import Effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-#: surrogates of the residual: their largest gain is exceeded by chance in 1 of 17 cases
+#: number of surrogates of the residual: chance exceeds their largest gain in 1 of 17 cases
 SURROGATES = 16
-#: share that a candidate must gain at its trial to be fitted jointly, and the most of a round
+#: share of the error that a candidate must gain at its trial to be fitted jointly, and the largest
+#: number of joint fits in a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
-#: share of the gain of the best after a few iterations below which a fit is not brought to its end
+#: a fit is stopped early if it gains a smaller share of the best gain after a few iterations
 WORTH_END = 0.5
-#: trials of a candidate that a joint fit starts from, its iterations, and how many candidates of a
-#: round are fitted to the end
+#: number of trials of a candidate that start a joint fit, iterations of this fit, and number of
+#: candidates of a round that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: ratio to what was left before up to which the trial beside a sum of plays is a start, and ratio
-#: beyond which another start, or another candidate, will not come first any more
+#: largest ratio of the error of a trial beside a sum of plays to the error before, for the trial
+#: to be a start; and ratios of errors beyond which another start, or another candidate, can no
+#: longer become the best
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
-#: ratio to what the last of those leaves up to which another one is fitted to the end, too
+#: a further candidate is fitted to the end if its error is at most this factor times the error of
+#: the last of the `FINAL` candidates
 LEVEL = 1.05
 
-#: what fails one start, and leaves the others going
+#: errors that end one start; the other starts continue
 Failure = ModelError | IdentificationError
-#: how often a caller is asked whether to go on [s]
+#: interval at which a caller may stop the search [s]
 ASKED = 0.1
 
 
@@ -68,16 +72,16 @@ class Round:
     Attributes
     ----------
     before : Fitted
-        What the candidates were added to.
+        The fit to which the candidates were added.
     best : dict of str to Scored
         The best trial of every candidate that could be tried.
     contenders : tuple of Fitted
-        Candidates that were fitted jointly with everything else, best first, and show where they
-        should.
+        Candidates after the joint fit, ordered by error.  Candidates that do not show in the
+        places of `signature` are left out.
     chance : dict of str to float
-        Mean square that a candidate gains on surrogates of the residual, at best.
+        Largest mean square that a candidate gains on surrogates of the residual.
     visible : dict of str to float
-        Share of a candidate's own columns that a refit of the rest does not swallow.
+        Share of a candidate's own columns that a refit of the rest cannot imitate.
     warnings : tuple of str
         Candidates whose joint fit failed, and why.
     """
@@ -110,12 +114,12 @@ def search_round(
     Score all candidates and fit the best of them jointly.
 
     `noise` is the mean square of the noise of a row, and `rng` draws the shifts of the surrogates.
-    What does not promise to reach the mean square `goal` is not fitted on.
+    A fit ends early if it cannot reach the mean square `goal`.
     """
     n = simulator.rows.n
     shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
     shifted = [np.roll(before.e, int(k)) for k in shifts]
-    # of a residual that repeats, a shift by a period is no surrogate
+    # a residual may be periodic: a shift by one period is then no surrogate
     shifted.sort(key=lambda e: abs(float(e @ before.e)))
     surrogates = np.stack(shifted[:SURROGATES], axis=1)
     trials: dict[str, list[Scored]] = {}
@@ -137,13 +141,13 @@ def search_round(
     promising = [scores for scores in trials.values() if total - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
     chosen = promising[:JOINT_FITS]
-    # a small step does not tell from its like what an effect does in full
+    # a small step does not separate an effect from its look-alikes, so these are fitted, too
     alike = look_alikes(chosen[0][0].effect.name) if chosen else ()
     chosen += [scores for scores in promising[JOINT_FITS:] if scores[0].effect.name in alike]
     starts = [
         (
             scores[0].effect,
-            # a law that looks best while it is small need not be the one that fits best
+            # the law with the best small step may not be the law with the best fit
             [before.state.with_effect(started(simulator.rows, s)) for s in scores[:STARTS]],
         )
         for scores in chosen
@@ -168,16 +172,16 @@ def _add_plain_starts(
     columns: TrialColumns,
 ) -> None:
     """
-    Add the best start of each effect beside a sum of plays, as an H of the wide law.
+    Add to each effect a start beside a sum of plays, converted to the wide law of H.
 
-    A wide H that has made up for an effect hardly lets go of it.  A start that leaves far more
-    than there was before is none, but of an effect that is either on or off.
+    A wide H that has absorbed an effect rarely releases it.  A start with a far larger error than
+    before is left out.  An effect that is either on or off keeps its start in any case.
     """
     law = before.state.law
     if not starts or law is None or law.name == 'plays':
         return
     plays = HysteresisLaw('plays', law.thresholds, law.span)
-    # it need be no better than a start
+    # a start needs no exact fit
     enough = WORTH_FIT * before.mean_square
     plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), enough=enough)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
@@ -198,9 +202,9 @@ def _contenders(
     tick: Tick,
 ) -> tuple[list[Fitted], list[str]]:
     """
-    Return the candidates that show, fitted jointly, best first, and the fits that failed.
+    Fit the candidates jointly; those that show, the best first, and warnings of failed fits.
 
-    What will not reach the mean square `worth` is not fitted on.
+    A fit ends early if it cannot reach the mean square `worth`.
     """
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
@@ -212,15 +216,15 @@ def _contenders(
     for i, (effect, states) in enumerate(starts):
         at = 0.5 + 0.5 * i / len(starts)
         alive()
-        # what will not gain a share of the best is hardly one of those fitted to the end, and
-        # nothing else is a rival of one that leaves nothing
+        # a candidate with a small share of the best gain is rarely among the candidates fitted to
+        # the end; a candidate with almost no error has no rivals
         goal = min(worth, before.mean_square - WORTH_END * (before.mean_square - least))
         if least < done:
             goal = min(goal, FORM_RATIO * least + done)
         found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
         fits = [one for one in found if not isinstance(one, Failure)]
         least = min([least, *(one.mean_square for one in fits)])
-        # a law that cannot run with these parameters is a ModelError, and no warning
+        # a ModelError means that a law cannot run with these parameters, which needs no warning
         failures = [one for one in found if isinstance(one, IdentificationError)]
         if fits:
             contenders.append(min(fits, key=lambda f: f.mean_square))
@@ -230,19 +234,19 @@ def _contenders(
     contenders.sort(key=lambda c: c.mean_square)
     gains = [before.mean_square - c.mean_square for c in contenders]
     is_shown = False
-    # a few iterations do not tell which of two that are level gets further
+    # a few iterations cannot rank two candidates with nearly equal errors
     last = max((c.mean_square for c in contenders[:FINAL]), default=0.0)
     level = [c for c in contenders if c.mean_square <= LEVEL * last]
     for i, contender in enumerate(level):
         if is_shown and gains[0] > 0.0 and gains[i] < WORTH_END * gains[0]:
             break
-        # one that stays further behind the first is no rival of it
+        # a candidate that stays further behind the first is not its rival
         goal = FORM_RATIO * contenders[0].mean_square + done if is_shown else worth
         try:
             fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
             is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
-                # a few iterations do not tell which base leads further
+                # a few iterations cannot rank the two bases
                 near = AHEAD * fitted.mean_square
                 goal = min(goal, near) if is_shown else goal
                 other = _to_the_end(simulator, other, noise, goal, alive)
@@ -263,10 +267,10 @@ def fit_starts(
     tick: Callable[[], None],
 ) -> list[Fitted | Failure]:
     """
-    Return what a fit makes of each state, side by side, or why it failed.
+    Fit each state, several at a time; the fits, or the error of each failed fit.
 
-    The fit is given a simulator that no other fit uses, a state, and what it has to call between
-    its steps.  `tick` is called meanwhile, by this thread alone, and may raise `Cancelled`.
+    `fit` receives a simulator of its own, a state, and a function that it must call between its
+    steps.  Meanwhile this thread alone calls `tick`, which may raise `Cancelled`.
     """
     copies = simulator.copies(len(states))
     stopped = Event()
@@ -300,7 +304,7 @@ def fit_starts(
             wait(futures)
             for copy in copies[1:]:
                 copy.forget()
-    # the one that stopped the others says why
+    # the error that stopped the other fits comes first
     errors = [future.exception() for future in futures]
     for error in sorted(filter(None, errors), key=lambda error: isinstance(error, Cancelled)):
         raise error
@@ -311,14 +315,14 @@ def fit_starts(
 def _begun(
     base: BaseColumns, goal: float, simulator: Simulator, state: State, tick: Callable[[], None]
 ) -> Fitted:
-    """Return a fit after a few steps."""
+    """Fit for a few iterations."""
     return fit_jointly(simulator, state, base, iterations=FIRST, goal=goal, tick=tick)
 
 
 def _to_the_end(
     simulator: Simulator, fitted: Fitted, noise: float, goal: float, tick: Callable[[], None]
 ) -> Fitted:
-    """Return a fit with fresh columns of H, as long as that makes a difference that shows."""
+    """Repeat a fit with fresh columns of H until the gain is too small to matter."""
     enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square
@@ -330,7 +334,7 @@ def _to_the_end(
 
 
 def gains_of(rows: Rows, this: Round) -> dict[str, float]:
-    """Return the mean square that each candidate of a round gains, tried or fitted jointly."""
+    """Mean square that each candidate of a round gains in its trial or in its joint fit."""
     total = float(this.before.errors.sum())
     gains = {name: (total - s.error) / rows.n for name, s in this.best.items()}
     for c in this.contenders:

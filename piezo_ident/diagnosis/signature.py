@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What an effect alone does, looked for where nothing else does it.
+Check an effect in the places where it alone acts.
 
-A hysteresis that the model does not fit leaves a residual that nearly any effect lowers a little.
-So creep and drift must show at rest, where no hysteresis moves, and a drifting gain within single
-motions, where a gain that depends on the kind of motion does not change.  There the effect, as
-large as it was fitted to all data, has to be what the data show: the factor
+If H fits poorly, nearly any effect lowers the residual a little.  Creep and drift must therefore
+show at rest, where no hysteresis moves.  A drifting gain must show within single motions, where a
+gain that depends on the kind of motion stays constant.  In these places the effect must have the
+size that was fitted to all data.  The factor
 
     kappa = 1 + <c, e> / <c, c>
 
-of its contribution c, e the residual with it in the model, both without what may differ from rest
-to rest or from motion to motion, is 1 for the right effect and anything for a wrong one.
+measures this.  Here c is the contribution of the effect and e is the residual with the effect in
+the model.  Terms that may differ between rests, or between motions, are projected out of c and e.
+kappa is 1 for the right effect, and any number for a wrong effect.
 """
 
 from __future__ import annotations
@@ -29,22 +30,23 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.residual.stretches import block_means, rests
 from scipy.ndimage import uniform_filter1d
 
-#: what dynamics leave behind a motion has died away after this time at rest [s]
+#: transients of the dynamics have died away after this time at rest [s]
 SETTLED = 0.05
-#: fewest rows of a rest or a motion
+#: smallest number of rows of a rest or a motion
 FEWEST = 20
-#: time over which a motion has a mean, a size and a speed [s]
+#: time over which the mean, size and speed of a motion are computed [s]
 LOCAL = 0.25
 
-#: rows, shape (k,), and columns of what may differ there, shape (k, p)
+#: rows, shape (k,), and columns to project out there, shape (k, p)
 Place = tuple[Integers, Array]
 
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
-    Return whether the effect added last shows where it should; True for one without such a place.
+    Return whether the last added effect shows in its own places; True if it has no such place.
 
-    So it has to with values that can be; `noise` is the mean square of the noise of a row.
+    The values of the effect must also be plausible.  `noise` is the mean square of the noise of a
+    row.
     """
     if fitted.name not in _PLACES:
         return True
@@ -72,7 +74,7 @@ def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
 
 
 def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:
-    """Give the rows of each rest of the command, whose mean is free."""
+    """Yield the rows of each rest of the command, with a constant to project out."""
     first = 0
     for run, keep in zip(rows.runs, rows.keep, strict=True):
         number = np.cumsum(keep) - 1 + first
@@ -87,9 +89,10 @@ def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:
 
 def _in_motion(rows: Rows, y: Array) -> Iterator[Place]:
     """
-    Give the rows of each run, and what a gain that depends on the motion may do.
+    Yield the rows of each run, and the columns of a gain that depends on the motion.
 
-    That is any square function of the local mean, size and speed of the command.
+    The columns are all quadratic functions of the local mean, size and speed of the command, and
+    the same functions times the displacement y.
     """
     first = 0
     for run, keep in zip(rows.runs, rows.keep, strict=True):
