@@ -2,23 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The decision: which candidate, by one ratio of what candidates leave of data that were held out.
+Decide which candidate is taken, from the errors of all candidates on held-out data.
 
-A candidate is a set K of effects in a model whose H and G are treated in some way.  Its error is
-the geometric mean of two mean squares, of blocks held out in spread sets and of whole kinds of
-motion held out, and a set has the error of its best way:
+A candidate is a set K of effects beside one treatment of H and G.  Its error E is the geometric
+mean of two mean squares: of blocks held out in spread sets, and of whole kinds of motion held out.
+The error of a set is the error of its best treatment:
 
     left(K) = max(E(K) - noise, 0) + NOISE_SHARE noise.
 
-A set is admissible if it is larger than the smallest effect, and if each of its effects takes most
-of what is left without it; beside another effect, of blocks alone, too.  Of the admissible sets
-the one that leaves least is taken, or one with fewer parameters that leaves about as much; sets
-of the same size that leave hardly more are its rivals, and with them it is a class.  Size decides,
-not significance: of 100,000 samples any law of the right trend takes a significant part.
+A set is admissible if it lowers the error by at least the smallest effect, and if each of its
+effects removes most of the error that is left without this effect.  Beside another effect, this
+must hold for the blocks alone, too.  The decision takes the admissible set with the smallest
+error, or a set with fewer parameters and about the same error.  Sets of the same size with a
+slightly larger error are its rivals; the set and its rivals form a class.  Size decides instead of
+significance: in 100,000 samples any law of the right trend gains a significant part.
 
-An effect that follows the path of the voltage is in any H wide enough, so beside that it takes
-nothing.  But where it has set in since the identification, the H as given does not hold it: where
-one such effect beside that H does most of what another H does, that is the finding.
+A wide enough H can imitate an effect that follows the path of the voltage, so such an effect gains
+little beside a refitted H.  If the effect appeared after the identification, the H as given lacks
+it.  If one such effect beside the given H does most of the work of a refitted H, the effect is the
+finding.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import find_effect
 
-#: loops that the H of any material has a little
+#: effect of minor loops that the H of any material shows a little
 OF_MATERIALS = 'noncongruent_minor_loops'
 
 
@@ -56,12 +58,12 @@ class Candidate:
     Attributes
     ----------
     effects : tuple of str
-        Names, sorted, but for those that tests of their own have shown.
+        Names, sorted, without the effects that tests of their own have shown.
     way : str
-        How H is treated: 'given', 'plays' or 'wide'.
+        Treatment of H: 'given', 'plays' or 'wide'.
     fitted : Fitted
     found_in : Round or None
-        The search that found it.
+        The search that produced the candidate.
     """
 
     effects: tuple[str, ...]
@@ -91,8 +93,8 @@ class Candidates:
     noise : float
         Mean square of the noise of a row.
     missed : float
-        What G may miss of motion like this by what it missed when it was identified, rms in % of
-        stroke: no smaller change of G can be told.
+        Possible error of G on this motion, derived from its error at the identification, rms in %
+        of stroke.  A smaller change of G cannot be detected.
     all : tuple of Candidate
     """
 
@@ -107,39 +109,40 @@ class Candidates:
 
     @property
     def least_share(self) -> float:
-        """What counts as left of the noise, a mean square."""
+        """Part of the noise that is added to each error, a mean square."""
         return NOISE_SHARE * self.noise
 
     def left(self, candidate: Candidate) -> float:
-        """Return what a candidate leaves beyond the noise, a mean square."""
+        """Error of a candidate beyond the noise, a mean square."""
         return self.left_by(candidate.fitted)
 
     def left_by(self, fitted: Fitted) -> float:
-        """Return what a fit leaves beyond the noise, a mean square."""
+        """Error of a fit beyond the noise, a mean square."""
         error = np.sqrt(fitted.errors.sum() * fitted.transfer.sum()) / self.rows.n
         return self.beyond_noise(float(error))
 
     def beyond_noise(self, square: float) -> float:
-        """Return a mean square without the noise, but for a share of it."""
+        """Subtract the noise from a mean square, then add a share of the noise."""
         return max(square - self.noise, 0.0) + self.least_share
 
     def _of_blocks(self, candidate: Candidate) -> float:
-        """Return what is left of blocks held out in spread sets alone."""
+        """Error beyond the noise on blocks held out in spread sets alone."""
         return self.beyond_noise(candidate.fitted.mean_square)
 
     def percent(self, left: float) -> float:
-        """Return what is left as rms in % of stroke."""
+        """Convert an error to rms in % of stroke."""
         return self.rows.percent(left - self.least_share)
 
     def is_part(self, left: float, whole: float) -> bool:
-        """Return whether what is left of a whole is more than little, and could be an effect."""
+        """Return whether an error is a large part of a whole, and as large as an effect."""
         return left > LITTLE * whole and self.percent(left) >= SMALLEST_EFFECT
 
     def of(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> tuple[Candidate, ...]:
         """
-        Return the candidates of a set, the best first; empty where there is none.
+        Return the candidates of a set, the best first; empty if the set has no candidate.
 
-        Beside a set that changes G a retuned G is a change, too, and does not count.
+        A retuned G is a change of G, too.  Candidates with a retuned G are left out if the set, or
+        the set `beside`, changes G.
         """
         some = [c for c in self.all if c.effects == effects]
         if change_g(beside) or change_g(effects):
@@ -156,7 +159,7 @@ class Candidates:
 
     @property
     def sets(self) -> tuple[tuple[str, ...], ...]:
-        """The sets of effects, the one that leaves least first."""
+        """Sets of effects, ordered by the error of the best candidate of each."""
         least: dict[tuple[str, ...], float] = {}
         for c in self.all:
             best = self.best(c.effects)
@@ -165,7 +168,9 @@ class Candidates:
         return tuple(sorted(least, key=least.__getitem__))
 
     def is_admissible(self, effects: tuple[str, ...]) -> bool:
-        """Return whether a set is large enough, and each of its effects takes most of the rest."""
+        """
+        Return whether a set is large enough, and each of its effects removes most of the error.
+        """
         best = self.best(effects)
         if not effects or best is None or self.rows.passes < PASSES:
             return False
@@ -181,7 +186,7 @@ class Candidates:
                 before = min(before, self._missed_by_g(part))
             if left > most * before:
                 return False
-            # beside another effect it must not be kinds of motion alone that speak for it
+            # beside another effect, whole kinds of motion must not be the only evidence
             if part and self._of_blocks(best) > most * self._of_blocks(other):
                 return False
             changes = change_g(tuple(set(effects) - set(part)))
@@ -190,7 +195,9 @@ class Candidates:
         return _beyond_chance(best)
 
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
-        """Return what is left with a changed G that takes no more than G missed before."""
+        """
+        Smallest error of a set plus a change of G that is no larger than the known error of G.
+        """
         before, found = self.best(part), math.inf
         for name in (name for name in self._names if change_g([name])):
             other = self.best(tuple(sorted((*part, name))))
@@ -205,7 +212,7 @@ class Candidates:
         return {name for c in self.all for name in c.effects}
 
     def _as_given(self, effects: tuple[str, ...]) -> float:
-        """Return what the model leaves with the H as given."""
+        """Error of the model with the H as given."""
         return min(self.left(c) for c in self.of((), effects) if c.way == 'given')
 
     @property
@@ -216,14 +223,14 @@ class Candidates:
 
     @property
     def given(self) -> float:
-        """What the model leaves as it was given."""
+        """Error of the model as it was given."""
         return self.left(self.as_given)
 
     def like_refit(self) -> tuple[Candidate, ...]:
         """
-        Return the effects of the path, beside the H as given, that do most of what a refit does.
+        Return the effects of the path that, beside the given H, do most of the work of a refit.
 
-        The best comes first.
+        The effect with the smallest error comes first.
         """
         given, refit = self.given, self.left(self.without())
         if given - refit < self.rows.square(SMALLEST_EFFECT) or self.rows.passes < PASSES:
@@ -242,21 +249,23 @@ class Candidates:
 @dataclass(frozen=True, eq=False)
 class Decision:
     """
-    What is decided.
+    Result of the decision.
 
     Attributes
     ----------
     best : Candidate or None
-        None where no set of effects is admissible.
+        None if no set of effects is admissible.
     rivals : tuple of tuple of str
-        Sets of the same size that are not separated from it, the best first.
+        Sets of the same size that are not separated from the best set, ordered by error.
     names : tuple of str
-        Of its effects and those of its rivals, the ones that not all of them have: a class.
+        A class: names of the effects in the best set and in its rivals that not every set
+        contains.
     whole : float
-        What there was to explain, a mean square: what the H and G that fit best leave without an
-        effect, or what the model leaves as given where an effect has set in since.
+        Error to explain, a mean square.  It is the error of the best H and G without an effect.
+        For an effect that appeared after the identification, it is the error of the model as
+        given.
     set_in : bool
-        Whether one has.
+        Whether an effect has appeared since the identification.
     """
 
     best: Candidate | None
@@ -267,7 +276,7 @@ class Decision:
 
 
 def decide(candidates: Candidates) -> Decision:
-    """Return the decision on candidates."""
+    """Decide between candidates."""
     possible = [s for s in candidates.sets if candidates.is_admissible(s)]
     bests = [c for c in map(candidates.best, possible) if c is not None]
     if not bests:
@@ -282,10 +291,10 @@ def decide(candidates: Candidates) -> Decision:
 
 def _set_in(candidates: Candidates) -> Decision:
     """
-    Return the decision where no set is admissible beside the H that fits best.
+    Decide whether an effect has set in, if no set is admissible beside the best H.
 
-    Without labels nothing tells what the model missed of other motion from the beginning.  Loops
-    that are not congruent need not have set in: the H of any material has some.
+    Without labels the earlier error on other motion is unknown, so the decision stays empty.  The
+    same holds for loops that are not congruent: the H of any material has some from the beginning.
     """
     found = candidates.like_refit()
     if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
@@ -298,7 +307,7 @@ def _set_in(candidates: Candidates) -> Decision:
 
 
 def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
-    """Return the best candidate, or one that leaves about as much with fewer parameters."""
+    """Return the candidate with the fewest parameters among those about as good as the best."""
     least = min(map(candidates.left, some))
     alike = [c for c in some if candidates.left(c) <= ALIKE * least]
     return min(alike, key=lambda c: (c.size, candidates.left(c)))
@@ -306,10 +315,11 @@ def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
 
 def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...], ...]:
     """
-    Return the sets of the size of the best one that are not separated from it, the best first.
+    Return the sets of equal size that are not separated from the best set, ordered by error.
 
-    They leave hardly more.  Where the best one explains a part alone, the rest may be of any law:
-    then a set that takes most of what the best one takes is one of them, too.
+    Their errors are at most slightly larger.  If the best set explains only a part, the law of the
+    remaining error is unknown.  A set is then a rival, too, if it removes most of the error that
+    the best set removes.
     """
     left, whole = candidates.left(best), candidates.left(candidates.without(best.effects))
     most = RIVALS * left
@@ -326,12 +336,12 @@ def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...],
 
 
 def change_g(effects: Sequence[str]) -> bool:
-    """Return whether one of some effects changes G."""
+    """Return whether at least one of the effects changes G."""
     return any(find_effect(name).in_dynamics for name in effects)
 
 
 def _parts(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Give all smaller sets of the same effects."""
+    """Yield all smaller sets of the same effects."""
     for k in range(len(effects)):
         yield from itertools.combinations(effects, k)
 
@@ -339,7 +349,7 @@ def _parts(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
 def _beyond_chance(candidate: Candidate) -> bool:
     """Return whether the effect found last gains more than on surrogates of the residual."""
     found, fitted = candidate.found_in, candidate.fitted
-    # what follows time alone fits a shifted residual as well
+    # an effect that only depends on time fits a shifted residual equally well
     if found is None or find_effect(fitted.name).time_driven:
         return True
     gain = found.before.mean_square - fitted.mean_square

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The effects that were added, with their shares and parameters."""
+"""Report the effects that were added, with their shares and parameters."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from piezo_ident.diagnosis.verdict import Findings
 
 def found_effects(rows: Rows, findings: Findings, last: Fitted) -> tuple[FoundEffect, ...]:
     """
-    Return the effects that were added, with parameters as in the record with most rows.
+    Report the effects that were added, with their parameters in the record with most rows.
 
-    `last` is the fit that the refined model comes from.
+    `last` is the fit behind the refined model.
     """
     if not findings.effects:
         return ()
@@ -49,15 +49,15 @@ def found_effects(rows: Rows, findings: Findings, last: Fitted) -> tuple[FoundEf
 
 def _standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, str, int], float]:
     """
-    Return the standard deviations of the free parameters, in the record that has most rows.
+    Compute the standard deviations of the free parameters in the record with most rows.
 
-    The sandwich estimator over blocks, each one observation.  Keys are the effect's place, the
-    parameter's name, and the place in a vector (0 for a number).
+    The sandwich estimator treats each block as one observation.  A key holds the place of the
+    effect, the name of the parameter, and the index in a vector (0 for a number).
     """
     M = fitted.J
     size = np.linalg.norm(M, axis=0)
     equations = normal_equations(rows, M, fitted.e[:, None])
-    # the given H is no observation, but it holds what these leave open
+    # the given H is not an observation, but it holds the parameters that these rows leave open
     A = summed(equations, fitted.pull)[0] / np.outer(size, size)
     A[np.diag_indices_from(A)] += 1e-10
     gradients = equations.b[:, :, 0] / size
@@ -69,7 +69,7 @@ def _standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, s
     known = {}
     for j, parameter in enumerate(fitted.parameters, start=first):
         if np.isfinite(deviation[j]) and parameter.record in (None, rows.longest):
-            # of a logarithm, so relative
+            # the deviation of a logarithm is relative
             factor = abs(parameter.get(fitted.state)) if parameter.logarithmic else 1.0
             key = (parameter.effect, parameter.name, parameter.index or 0)
             known[key] = float(deviation[j]) * factor

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is held out together: stretches with one label, or blocks whose command moves alike."""
+"""Choose the blocks that are held out together: blocks of one label, or of similar motion."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.identification.prepare import Run
 from piezo_ident.selection.motion_kinds import description, interleaved, KINDS, kinds_of
 
-#: whole stretches of one kind that are held out in turn, at most
+#: largest number of kinds of motion that are held out in turn
 GROUPS = 8
-#: name of the kinds that are too small, of a part of what has one kind alone, and of blocks whose
-#: command moves alike
+#: names of a kind that joins small kinds, of a part of a single kind, and of blocks whose command
+#: moves alike
 REST, PART, ALIKE = 'the rest', ', part ', 'motion that is alike'
 
 
 def are_parts(labels: Sequence[str]) -> bool:
-    """Return whether names of kinds are no labels of the user."""
+    """Return whether the names of kinds are not labels of the user."""
     return all(x in (REST, ALIKE) or PART in x for x in labels)
 
 
 def stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
-    """Return label, first row and end of the segments of a run; everything belongs to one."""
+    """Return label, first row and end of the segments of a run; each row belongs to a segment."""
     n = run.piece.n // m
     if not run.piece.segments:
         # without labels, parts of the time stand for kinds
@@ -52,11 +52,11 @@ def held_out_kinds(
     labels: Sequence[str], commands: Sequence[Array]
 ) -> tuple[Integers, tuple[str, ...]]:
     """
-    Return which blocks make a kind of motion, shape (blocks,), and the names of the kinds.
+    Assign each block to a kind of motion, shape (blocks,), and name the kinds.
 
-    `labels` are those of the blocks, and `commands` their rows.  The smallest kinds are put
-    together.  Where labels name fewer than two kinds, mean, size and speed of the command tell
-    them, and where that tells too few, parts of the time stand for them.
+    `labels` holds the label of each block, and `commands` its rows.  The smallest kinds are
+    joined.  If the labels name fewer than two kinds, the kinds follow from mean, size and speed of
+    the command.  If that gives too few kinds, parts of the time replace them.
     """
     sizes = [u.size for u in commands]
     size: dict[str, int] = {}
@@ -76,8 +76,8 @@ def held_out_kinds(
         if found is not None:
             return found
     if len(names) == 1 or few:
-        # of one kind, or where most of a record is not judged, nothing would be left to predict
-        # from: parts of what is judged stand for kinds
+        # one kind, or few judged parts, would leave no data to predict from: parts of the judged
+        # data replace the kinds
         whole = ' and '.join(dict.fromkeys(name.partition(PART)[0] for name in names))
         group = np.arange(group.size) * GROUPS // group.size
         names = [f'{whole}{PART}{i + 1}' for i in range(int(group.max()) + 1)]
@@ -86,10 +86,10 @@ def held_out_kinds(
 
 def _by_command(commands: Sequence[Array]) -> tuple[Integers, tuple[str, ...]] | None:
     """
-    Return kinds by what the command of each block does, None where they are too few.
+    Assign each block to a kind by its command; None if the kinds are too few.
 
-    A kind at the edge of place, size or speed would have to be extrapolated: its blocks are held
-    out in spread sets.
+    A kind at the edge of place, size or speed would require extrapolation.  Blocks of such a kind
+    are held out in spread sets instead.
     """
     kinds = kinds_of(np.array([description(u) for u in commands]))
     if kinds is None:

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The joint fit: weights of H, offsets and effects together, by free-run error.
+Fit the weights of H, offsets and effects jointly by the free-run error.
 
-Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay keep their values
-but for a factor near one (`retuning.retuned`): a change of them is a candidate of its own.
+The fit uses Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay stay,
+except for a factor near one (`retuning.retuned`).  A larger change of them is an effect, and so a
+candidate.
 """
 
 from __future__ import annotations
@@ -32,18 +33,20 @@ from piezo_ident.diagnosis.state import State
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
-#: first damping, a share of the energy of each column, and the least
+#: first damping, as a share of the energy of each column, and smallest damping
 DAMPING, LEAST_DAMPING = 1e-4, 1e-9
-#: steps in a row that keep too little of what they promise before columns of H are made anew
+#: consecutive steps that gain too little of their predicted gain, after which the columns of H are
+#: computed again
 POOR = 2
-#: steps gain less and less, but as a forecast no less than this times the one before
+#: lowest ratio of a gain to the gain before, as assumed for the forecast of future gains
 LEAST_RATIO = 0.5
-#: share of what shows a parameter that other kinds of excitation must hold to tell it
+#: share of the energy of a parameter's column that other kinds of excitation must hold
 FIRM = 0.01
 #: expected size of a weight of H, and of its other coefficients, normalised: the prior that keeps
 #: collinear plays small
 WEIGHT_SPREAD, WIDE_SPREAD = 0.1, 1.0
-#: what creeps on from before a record costs a fit as much as an error of so much of it
+#: amplitude error, normalised, whose cost equals that of creep from before a record with the same
+#: ratio: the fit adds (0.003)^2 n times the square of this creep
 EARLIER_COST = 0.003
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
@@ -58,7 +61,7 @@ class Fitted:
     ----------
     state : State
     base : BaseColumns
-        Used for H.
+        Columns that were used for H.
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
     moving : ndarray, shape (n, q)
@@ -68,9 +71,9 @@ class Fitted:
     parameters : tuple of FreeParameter
     prior : ndarray, shape (p,)
     errors, transfer : ndarray, shape (blocks,)
-        Sum of squares of each block, held out in spread sets and in whole kinds.
+        Sum of squares of each block, held out in spread sets and in whole kinds of motion.
     pull : Pull or None
-        What was fitted besides the rows, of the free columns: the given H as data.
+        Normal equations of the information besides the rows, for the free columns.
     """
 
     state: State
@@ -86,7 +89,7 @@ class Fitted:
 
     @property
     def J(self) -> Array:
-        """Derivatives by all that is free: coefficients of H, offsets, parameters."""
+        """Derivatives by all free numbers: coefficients of H, offsets, parameters."""
         known = self.base.columns.shape[1]
         parts = (self.base.columns.T[self.free[:known]], self.moving.T[self.free[known:]])
         return np.concatenate(parts).T
@@ -104,17 +107,19 @@ class Fitted:
     @property
     def reached(self) -> float:
         """
-        The same, and no less than what the fit itself leaves.
+        Mean square error of held-out blocks, or of the fit itself if that is larger.
 
-        With columns of another state, blocks held out promise a step that cannot be made.
+        If the columns belong to another state, the held-out error may promise a step that is
+        impossible.
         """
         return max(self.mean_square, float(self.e @ self.e / self.e.size))
 
     def held_out_residual(self, rows: Rows, sets: Integers | None = None) -> Array:
         """
-        Return the residual of every row, fitted to other blocks; shape (n,), normalised.
+        Compute the residual of every row with parameters fitted to other blocks; shape (n,).
 
-        Blocks of one number in `sets` are held out together; spread over all data when absent.
+        The residual is normalised.  Blocks with the same number in `sets` are held out together;
+        the default are sets spread over all data.
         """
         prior = self.prior if sets is None else _firm(rows, self.state, self.prior, self.moving)
         sets = rows.fold if sets is None else sets
@@ -122,7 +127,7 @@ class Fitted:
 
 
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
-    """Return H refitted as one of a family, effects kept as they are, and the columns used."""
+    """Refit H within a law while effects stay; the new state and the columns used."""
     rows, m = simulator.rows, law.size
     columns, added = simulator.base_columns(law), simulator.added_columns(state)
     base = BaseColumns.of(rows, np.concatenate([columns, added.T]).T)
@@ -138,9 +143,9 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
     """
-    Return the columns of a refit of H in a state, its effects and a retuned G included.
+    Compute the columns of a refit of H in a state with its effects and a retuned G.
 
-    An H of no law stays as it is: what only adds alone.
+    An H without a law stays fixed: the columns are then the additive columns alone.
     """
     rows, added = simulator.rows, simulator.added_columns(state)
     if state.law is None:
@@ -162,18 +167,18 @@ def fit_jointly(
     pull_at: Callable[[State, int], Pull] | None = None,
 ) -> Fitted:
     """
-    Fit everything that a state holds by the free-run error; its thresholds, those of `base`, stay.
+    Fit all free numbers of a state by the free-run error; the thresholds of `base` stay.
 
-    Where steps keep too little of what they promise, the columns of H are made anew, once.  A step
-    that lowers the mean square by less than `enough` is the last one, and one that promises less
-    is not made.  So is one after which the steps that are left, were they like it or falling as
-    they do, would not reach the mean square `goal` of what is fitted.  `tick` is called between
-    the steps, and may raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives what is fitted
-    besides the rows, in a state of so many free numbers.  Singular equations raise
-    IdentificationError, an effect that cannot run on these data ModelError.
+    If steps gain too little of their predicted gain, the columns of H are computed again, once.
+    The fit ends after a step that lowers the mean square by less than `enough`, and before a step
+    that promises less.  It also ends if the remaining steps, with equal or falling gains, would
+    not reach the mean square `goal` of the fitted rows.  `tick` is called between the steps, and
+    may raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives information besides the rows,
+    for a state and its number of free numbers.  Singular equations raise IdentificationError, and
+    an effect that cannot run on these data raises ModelError.
     """
     rows = simulator.rows
-    # an H that stays, or is drawn to the given one, leaves another gain to the effects
+    # a fixed H, or an H that is drawn to the given one, leaves changes of its gain to the effects
     free_h = state.law is not None and pull_at is None
     parameters = free_parameters(state, len(rows.names), rows.longest if free_h else None)
     p = base.columns.shape[1] + len(parameters)
@@ -218,10 +223,10 @@ def fit_jointly(
         may_renew = more > 1 and base is old and state.law is not None
         is_slow = poor > 0 and may_renew
         if poor >= POOR and may_renew:
-            # what effects make of H is no longer what its columns say
+            # the effects now change H in another way than its columns assume
             base = base_at(simulator, state)
         moving = _derivatives(simulator, state, parameters, tick)
-        # a first step tells little of those behind it, and so do steps with old columns
+        # a first step, or steps with old columns, say little about later steps
         hopeless = done > 0 and not is_slow and after - _to_come(gain, last, more) > goal * e.size
         if hopeless or gain < least:
             break
@@ -250,10 +255,10 @@ def fit_jointly(
 
 
 def _to_come(gain: float, last: float, more: int) -> float:
-    """Return what `more` steps may gain behind one and the `last` one before it."""
+    """Forecast the gain of `more` steps from the gains of the last two steps."""
     if gain >= last:
         return more * gain
-    # a fall that one step shows need not be as steep
+    # the fall between two steps may overestimate the later fall
     ratio = max(gain / last, LEAST_RATIO)
     return gain * min(more, ratio / (1.0 - ratio))
 
@@ -264,10 +269,10 @@ def _loss(e: Array, pull: Pull | None) -> float:
 
 def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     """
-    Return a prior that keeps parameters which only a kind of excitation left out can tell.
+    Strengthen the prior for parameters that only a left-out kind of excitation determines.
 
-    A limit of the slew rate that nothing but a multisine reaches would be anything without it.
-    What creeps on as a record begins is told by the motion there, and by no other.
+    Example: only a multisine reaches a limit of the slew rate, so the limit is free without it.
+    Creep from earlier motion is determined by the motion at the start of a record alone.
     """
     firm = prior.copy()
     firm[_places_of_decays(state)] += rows.n / FIRM
@@ -278,9 +283,9 @@ def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
 def _prior(
     rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
 ) -> Array:
-    # neighbouring residuals are alike: a block counts as a few observations, not as thousands
+    # neighbouring residuals are similar: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
-    # curves and lags are nearly collinear: only large steps of theirs do anything
+    # curves and lags are nearly collinear: only large steps of them have an effect
     plays = 0 if state.law is None else state.law.thresholds.size
     spread, size = np.full(p, np.inf), state.coefficients.size
     spread[:size] = np.where(np.arange(size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
@@ -291,20 +296,20 @@ def _prior(
 
 
 def _places_of_decays(state: State) -> slice:
-    """Return the places of what creeps on from before, behind H and the offsets."""
+    """Return the places of creep from earlier motion, behind H and the offsets."""
     first = state.coefficients.size + state.offsets.size
     return slice(first, first + state.earlier.size)
 
 
 def cost_of_decays(rows: Rows) -> float:
-    """Return the weight of the pull of what creeps on from before towards zero."""
+    """Return the weight of the pull of creep from earlier motion towards zero."""
     return rows.n * EARLIER_COST**2
 
 
 def _with_known(
     state: State, parameters: Sequence[FreeParameter], prior: Array, pull: Pull | None
 ) -> Pull | None:
-    """Return a pull with that of what is known to be small towards zero; `prior` is its weight."""
+    """Add to a pull the pull of numbers known to be small towards zero, weighted by `prior`."""
     p = prior.size
     size = np.zeros(p)
     size[_places_of_decays(state)] = state.earlier.ravel()
@@ -342,7 +347,7 @@ def _derivatives(
     for j, column in quick.items():
         columns[j] = column
     for (j, _), change in zip(others, simulator.varied(moved), strict=True):
-        # one that cannot be moved, by a bound that depends on other parameters, stays
+        # a bound that depends on other parameters may forbid a move: the derivative is then zero
         if change is not None:
             columns[j] = change / steps[j]
     return columns.T
@@ -358,7 +363,7 @@ def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[
 
 
 def _only_adds(state: State, parameter: FreeParameter) -> bool:
-    """Return whether a number belongs to an effect that lets the signal pass as it is."""
+    """Return whether a parameter belongs to an effect that only adds to the signal."""
     i = parameter.effect
     return i is not None and state.effects[i].effect.change == 'passed'
 
@@ -366,7 +371,9 @@ def _only_adds(state: State, parameter: FreeParameter) -> bool:
 def _moved(
     state: State, parameters: tuple[FreeParameter, ...], step: Array, lower: Array, factor: float
 ) -> State:
-    """Return the state after a step, that of H divided by a factor, but for steps to a bound."""
+    """
+    Return the state after a step; steps of H are divided by `factor` unless they reach a bound.
+    """
     m, k = state.coefficients.size, state.only_adds.size
     new = state.with_only_added(state.only_adds + step[m : m + k])
     if state.law is not None:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sentence of a diagnosis and its warnings."""
+"""Word the sentence of a diagnosis and its warnings."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
 
-#: share of the data that needs no word about the rest
+#: share of the data that must be judged; a smaller share causes a warning
 NEARLY_ALL = 0.9
-#: retuning of G that is worth a warning: samples of delay, or a share of the fast motion
+#: retuning of G that causes a warning: samples of delay, or a share of the fast motion
 TUNED = 0.05
 
 
 def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
-    """Return what the unexplained rest is."""
+    """Describe the unexplained error."""
     if smallest is None:
         return (
             f'the voltage passes its range {passes:.1f} times, so no effect could be '
@@ -42,7 +42,7 @@ def left_over(findings: Findings, smallest: float | None, passes: float) -> str:
 
 
 def part_searched(records: Sequence[Record], part: Sequence[Record]) -> str:
-    """Return how much of the records was searched."""
+    """Say which part of the records was searched."""
     n, of = (sum(r.n for r in some) for some in (part, records))
     seconds, whole = (sum(r.duration for r in some) for some in (part, records))
     return (
@@ -52,7 +52,7 @@ def part_searched(records: Sequence[Record], part: Sequence[Record]) -> str:
 
 
 def part_judged(rows: Rows) -> list[str]:
-    """Return how much of the data was judged, where that is not nearly all."""
+    """Say which part of the data was judged; empty if it is nearly all."""
     runs = zip(rows.runs, rows.keep, strict=True)
     seconds = sum(rows.m * int(keep.sum()) / run.piece.sample_rate for run, keep in runs)
     whole = sum(run.piece.n / run.piece.sample_rate for run in rows.runs)
@@ -66,9 +66,9 @@ def part_judged(rows: Rows) -> list[str]:
 
 def warnings_of(given: StageModel, refined: Refined, floor: NoiseFloor, crept: float) -> list[str]:
     """
-    Return what a user of the refined model must know.
+    List the warnings for a user of the refined model.
 
-    `crept` is the most that crept on from before a record, % of stroke.
+    `crept` is the largest displacement through creep from before a record, % of stroke.
     """
     state = refined.state
     found = []
@@ -95,7 +95,7 @@ def warnings_of(given: StageModel, refined: Refined, floor: NoiseFloor, crept: f
         )
     (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
     if low > least or high < most:
-        # an H that stays as it was given was not
+        # an H that stays as given was not fitted
         what = 'the effects were fitted' if state.law is None else 'the hysteresis was refitted'
         found.append(
             f'{what} to {low:g} .. {high:g} V alone, and the refined model '
@@ -119,7 +119,7 @@ def _of_time_driven(added: Added, h_is_given: bool) -> str:
 
 
 def sentence(result: Diagnosis) -> str:
-    """Return what was found, what became of the model, and what the data leave open."""
+    """Word the finding, the fate of the model, and the questions that the data leave open."""
     outcome = _outcome(result)
     texts = ['; '.join(filter(None, (_finding(result), outcome)))]
     if result.group and not result.effects:
@@ -137,7 +137,7 @@ def sentence(result: Diagnosis) -> str:
 
 
 def _finding(result: Diagnosis) -> str:
-    """Return what the verdict says."""
+    """Word the verdict."""
     rest, smallest = result.unexplained, result.smallest_detectable
     if result.effects:
         explained = _explained(result)
@@ -170,20 +170,23 @@ def _finding(result: Diagnosis) -> str:
 
 
 def _explained(result: Diagnosis) -> str:
-    """Return which effects explain how much of what."""
+    """Say which effects explain which share of the error."""
     missed = 'what the model missed'
     if not result.set_in and result.refit.overall < 0.5 * result.before.overall:
-        # shares are of what a refit leaves: a sensor set to zero again is no effect
+        # shares are then relative to the error of a refit: a sensor that was zeroed again is no
+        # effect
         missed = 'what a refit of the hysteresis leaves'
     names = ' and '.join(effect.name.replace('_', ' ') for effect in result.effects)
     explains = 'explains' if len(result.effects) == 1 else 'explain'
     share = 100.0 * (1.0 - result.unexplained.share)
-    # a line that a test of its own has shown may be little of what is missed
+    # a line found by its own test may explain less than 1 % of the error
     return f'{names} {explains} {share:{".0f" if share >= 1.0 else ".1g"}} % of {missed}'
 
 
 def _outcome(result: Diagnosis) -> str:
-    """Return what became of the model, and of its error; empty where there was nothing to do."""
+    """
+    Say whether the model changed, and how its error fell; empty if the model needed no change.
+    """
     before, refit, after = (e.overall for e in (result.before, result.refit, result.after))
     if result.changes:
         fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'

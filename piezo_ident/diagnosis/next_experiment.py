@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The next experiment: which excitation would decide what these data leave open.
+Suggest the next experiment: the excitation that answers the questions these data leave open.
 
-Every effect shows in some motions and hides in others, and some imitate each other where such a
-motion is missing: creep lowers the slope of the loop as the frequency rises, just as a hysteresis
-does whose thresholds grow with the speed.  The motions that would decide what is in doubt, and
-that the data do not have, are asked for.
+Each effect shows in some motions and hides in others.  Some effects imitate each other if a
+certain motion is missing.  Example: creep lowers the slope of the loop at low frequencies less and
+less as the frequency rises, and so do thresholds that grow with the speed.  The suggestion names
+motions that separate the doubtful effects and that the data lack.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from piezo_ident.residual.stretches import rests
 Kind = Literal['sweeps', 'holds']
 Motion = Callable[[Sequence[Record], float], bool]
 
-#: change of the voltage that is a step, share of its range
+#: smallest change of the voltage that counts as a step, share of its range
 STEP = 0.15
-#: a hold that shows creep, a stretch of rest that shows hum, how much shorter each may be, and
-#: how long a step may take [s]
+#: duration of a hold that shows creep, of a rest that shows hum, tolerance of each duration, and
+#: longest duration of a step [s]
 HOLD, REST, SLACK, SUDDEN = 2.0, 1.0, 0.02, 0.5
-#: share of the range that is nearly all of it, and of one that is a minor loop
+#: smallest share of the range of a full sweep, and largest share of a minor loop
 FULL, MINOR = 0.9, 0.5
-#: speed of a slow sweep [ranges a second], frequency of a fast sine [Hz]
+#: highest speed of a slow sweep [ranges a second], lowest frequency of a fast sine [Hz]
 SLOW, FAST = 8.0, 20.0
-#: factor between two amplitudes that are not the same
+#: smallest ratio of two amplitudes that count as different
 APART = 2.0
 
 
 @dataclass(frozen=True)
 class Experiment:
     """
-    What to measure next, and what is in doubt without, for people.
+    The next measurement, and the doubt that it removes, in words.
 
-    'sweeps' are motions of many kinds, 'holds' steps with long holds.
+    'sweeps' are motions of many kinds, 'holds' are steps with long holds.
     """
 
     kind: Kind
@@ -57,10 +57,10 @@ def next_experiment(
     diagnosis: Diagnosis | None, records: Sequence[Record] = (), asked: Sequence[Kind] = ()
 ) -> Experiment | None:
     """
-    Return the experiment that would decide what is open, None when nothing is or none would.
+    Return the experiment that answers an open question; None if no question or experiment is left.
 
-    First comes what was found or could not be separated, then what could not be tested at all.
-    Without a diagnosis there were no data to judge.  What was asked for already is not asked for
+    Found effects and effects that could not be separated come first, then untestable effects.
+    Without a diagnosis the data held no motion to judge.  A kind in `asked` is not suggested
     again.
 
     >>> next_experiment(None).kind
@@ -84,7 +84,9 @@ def next_experiment(
 
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[tuple[tuple[str, ...], str, str]]:
-    """Yield names in doubt, the gravest first, which a motion must show ('': any), and how."""
+    """
+    Yield doubtful effects, the gravest doubt first; the effect a motion must show ('': any); how.
+    """
     alike, untested = 'cannot be separated', 'cannot be tested'
     if diagnosis.group is not None:
         yield diagnosis.group.names, '', alike
@@ -118,7 +120,7 @@ def _has_rest(records: Sequence[Record], span: float) -> bool:
 
 
 def _segments(records: Sequence[Record]) -> Iterator[tuple[str, Array, float]]:
-    """Yield label, voltage and sampling rate of every segment; a piece without any is one."""
+    """Yield label, voltage and sampling rate of every segment; a piece without segments is one."""
     for record in records:
         for piece in record:
             for s in piece.segments:
@@ -173,7 +175,7 @@ def _has_repeat(records: Sequence[Record], span: float) -> bool:
                 v = piece.v[s.start : s.stop]
                 size = float(np.ptp(v))
                 if size >= STEP * span and s.kind != 'ramp':
-                    # the same within a tenth or so
+                    # equal motions differ by a tenth at most, approximately
                     place = (round(20 * size / span), round(20 * float(v.min()) / span))
                     fast = round(4 * np.log2(_speed(v, piece.sample_rate)))
                     starts.setdefault((*place, fast), []).append(s.start)
@@ -184,7 +186,7 @@ def _has_repeat(records: Sequence[Record], span: float) -> bool:
 
 _EVEN = ('even_nonlinearity', 'preload_loss', 'noncongruent_minor_loops', 'sensor_nonlinearity')
 _FAST_EFFECTS = ('delay_change', 'changed_dynamics', 'amplifier_lag', 'slew_limit')
-#: motions, the program that has them, the effects that they show, and whether data have them
+#: motions; the program that contains each; the effects that it shows; a test whether data hold it
 _MOTIONS: tuple[tuple[str, Kind, tuple[str, ...], Motion], ...] = (
     (
         f'a hold of at least {HOLD:g} s after a step',
@@ -230,7 +232,8 @@ _MOTIONS: tuple[tuple[str, Kind, tuple[str, ...], Motion], ...] = (
 
 # -- effects that imitate each other -------------------------------------------------------------
 
-#: effects that imitate each other on most data: one is no answer while another was not tried
+#: effects that imitate each other on most data: a found effect is uncertain while a look-alike was
+#: not tried
 LOOK_ALIKES = (
     ('creep', 'thermal_drift', 'gain_drift'),
     ('creep', 'rate_dependent_hysteresis'),
@@ -238,15 +241,15 @@ LOOK_ALIKES = (
     ('even_nonlinearity', 'sensor_nonlinearity'),
     ('noncongruent_minor_loops', 'sensor_nonlinearity'),
     ('slew_limit', 'amplifier_lag'),
-    # all linear
+    # all are linear
     ('delay_change', 'amplifier_lag', 'changed_dynamics', 'input_feedthrough'),
-    # both act where a full stroke turns
+    # both act at the turns of a full stroke
     ('backlash', 'saturation'),
 )
 _HOLDS = 'holds of 10 s and more after steps of both signs, with the first motion at the end again'
 _TWO_SIZES = 'a sine near the first resonance at two amplitudes, one a tenth of the other'
 _FAST = 'a multisine that reaches beyond the first resonance'
-#: the experiment that separates two effects
+#: experiment that separates two effects
 _SEPARATED_BY = {
     ('creep', 'thermal_drift'): _HOLDS,
     ('creep', 'gain_drift'): _HOLDS,
@@ -295,7 +298,7 @@ _SEPARATED_BY = {
 
 def look_alikes(name: str) -> list[str]:
     """
-    Return the effects that imitate one.
+    List the effects that imitate an effect.
 
     Examples
     --------
@@ -308,7 +311,7 @@ def look_alikes(name: str) -> list[str]:
 
 def separating_experiment(names: Sequence[str]) -> str:
     """
-    Return what to record to tell effects apart.
+    Describe a recording that separates effects.
 
     Examples
     --------
@@ -317,7 +320,7 @@ def separating_experiment(names: Sequence[str]) -> str:
     """
     pairs = [tuple(sorted(pair)) for pair in combinations(names, 2)]
     known = [_SEPARATED_BY[pair] for pair in pairs if pair in _SEPARATED_BY]
-    # an effect of no listed pair names what it needs itself
+    # an effect without a listed pair states its own needs
     listed = {name for pair in pairs if pair in _SEPARATED_BY for name in pair}
     own = [find_effect(name).needs for name in names if name not in listed]
     return '; and '.join(dict.fromkeys(text for text in (*known, *own) if text))

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The numbers of a state, besides H and the offsets, that a fit may move."""
+"""List the numbers of a state that a fit may move, besides H and the offsets."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.state import State
 from piezo_ident.effects.trials import number_of
 
-#: finite difference of the logarithm of a parameter
+#: step of a finite difference in the logarithm of a parameter
 LOG_STEP = 1e-2
 
 
 @dataclass(frozen=True)
 class FreeParameter:
     """
-    One number that the fit may move, in one record or (None) in all.
+    One number that the fit may move, in one record or (None) in all records.
 
-    It belongs to an effect, by its place in the state, or (None) to the retuning of G.
+    `effect` is the place of its effect in the state, or None for the retuning of G.
     """
 
     effect: int | None
@@ -35,7 +35,7 @@ class FreeParameter:
     spread: float = float('inf')
 
     def get(self, state: State) -> float:
-        """Return its value."""
+        """Return the value of the number."""
         if self.effect is None:
             return state.retuning[self.index or 0]
         return number_of(
@@ -43,7 +43,7 @@ class FreeParameter:
         )
 
     def small(self, state: State) -> float:
-        """Return a step for a difference, within the bounds."""
+        """Choose a step for a finite difference within the bounds."""
         value = self.get(state)
         if self.logarithmic:
             is_free = self.upper / value >= np.exp(self.step)
@@ -82,10 +82,11 @@ def free_parameters(
     state: State, records: int, longest: int | None = None
 ) -> tuple[FreeParameter, ...]:
     """
-    Return every number of G's retuning and of the effects that the fit may move.
+    List every number of the retuning of G and of the effects that the fit may move.
 
-    `longest` is the record from whose start a change that H can make as well is counted, None
-    where H is not free to make it.
+    Some effects contain a change that H can imitate.  If H is free, the fit fixes this change to
+    zero in the record `longest`, so the other records count relative to it.  If H is fixed,
+    `longest` is None and the change is free in all records.
     """
     found = [
         FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
@@ -99,7 +100,7 @@ def free_parameters(
                 continue
             is_log = p.scale == 'log'
             step = LOG_STEP if is_log else (p.step or 1e-3)
-            # the amplitude of what follows time is another one in each record
+            # an effect driven by time has another amplitude in each record
             per_record = effect.time_driven and p.step > 0.0
             for k in range(records) if per_record else (None,):
                 held = 1 if p.first_stays and k == longest else 0

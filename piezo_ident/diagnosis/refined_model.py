@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The refined model: what of a fit holds beyond the records that it was fitted to."""
+"""Build the refined model from the parts of a fit that hold in other records, too."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from piezo_ident.effects import find_effect
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 
-#: a weight below this is left out of the refined model, normalised
+#: smaller weights of H are left out of the refined model, normalised
 NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Refined:
     """
-    The refined model, the fit that it comes from, and whether it, or H, stays as it was given.
+    Refined model, the state of its fit, and whether the whole model or H stays as given.
 
-    `shifts` is how far the sensor's zero has moved in each record [m], shape (records,).
+    `shifts` holds the movement of the zero of the sensor in each record [m], shape (records,).
     """
 
     model: StageModel
@@ -41,12 +41,12 @@ class Refined:
 
     @property
     def keeps_h(self) -> bool:
-        """Whether the file has the H as given."""
+        """Whether the model keeps the H as given."""
         return self.is_given or self.h_is_given
 
 
 def lasting(effects: tuple[str, ...]) -> list[str]:
-    """Return the effects that will be there in another record, too."""
+    """Select the effects that will act in another record, too."""
     return [name for name in effects if not find_effect(name).time_driven]
 
 
@@ -58,9 +58,10 @@ def refine(
     errors: tuple[Errors, Errors],
 ) -> Refined:
     """
-    Return the model that the user gets, from the last step of the walk with what was found.
+    Build the refined model for the user from the last step of the walk and the findings.
 
-    `errors` are those of the model as given, and of that step: the file tells them.
+    `errors` holds the errors of the model as given and of the last step.  The model file records
+    them.
     """
     rows, model = simulator.rows, simulator.model
     fitted, h_is_given = last.fitted, last.way == 'given'
@@ -68,12 +69,12 @@ def refine(
     shifts = moved_zeros(rows, given, e)
     if h_is_given and not findings.effects:
         return Refined(model, given, shifts * model.scaling.Y, is_given=True)
-    # beside an effect that was found, a smaller shift shows, too
+    # beside an effect that was found, a smaller shift is visible, too
     hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
     shifts = np.where(shifts == 0.0, hidden, shifts)
     state = replace(fitted.state, offsets=fitted.state.offsets - shifts)
     kept = _at_given_gain(simulator, given, state)
-    # what a gain or a drift makes of the next record, these do not tell
+    # gain and drift in the next record are unknown
     lasts = not findings.effects or bool(lasting(findings.effects))
     span = model.scaling.range if h_is_given else _range(simulator)
     told = errors if lasts and kept is state else errors[:1]
@@ -83,9 +84,10 @@ def refine(
 
 def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     """
-    Return a state whose gain, where it wanders, is the one of the model as given.
+    Return a state in which a wandering gain has the mean of the model as given.
 
-    The next record need not have the mean gain of these, and H was identified with the given one:
+    The next record need not have the mean gain of these records.  H was identified at the given
+    gain, and the effects of the model as given contributed to this gain.
     with the effects that were added, too, as far as they were there.
     """
     kept = [_elsewhere(added) for added in state.effects]
@@ -105,12 +107,15 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
 
 def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: Array) -> Array:
     """
-    Return by how much the sensor's zero has moved in each record, normalised; zero where not.
+    Find hidden shifts of the zero of the sensor, one for each record, normalised; 0 if none.
 
-    Behind an effect that the given model misses, its mean error over a record and the displacement
-    at rest beside its own must both say so, as it was off in one of them where it met the effect
-    when it was identified.  Neither what is left nor what it missed then may be as large.
-    `before` are the mean squares that the given model leaves of each record, shape (records,).
+    An effect that the given model lacks can imitate a shift.  Two estimates must therefore agree
+    in sign, and the smaller counts: the mean error of the given model, and the displacement at
+    rest relative to the given model.  The effect met during the identification distorts at most
+    one of the two.  The shift must exceed `MOVED_ZERO` times a limit.  The limit is the larger of
+    the remaining error and the expected error of the given model, but at most the error of the
+    given model on this record.  `before` holds the mean squared error of the given model on each
+    record, shape (records,).
     """
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))
@@ -126,7 +131,7 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
 
 
 def _at_rest(model: StageModel) -> float:
-    """Return the displacement at rest at the lowest voltage, hum and other axes left out."""
+    """Return the displacement at rest at the lowest voltage, without hum and other axes."""
     own = tuple(x for x in model.effects if x.name not in TESTED)
     y = replace(model, effects=own).stream().reset(model.scaling.range[0])
     return float(model.scaling.x(y))
@@ -134,20 +139,20 @@ def _at_rest(model: StageModel) -> float:
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
     """
-    Return by how much the sensor's zero has moved in each record, normalised; zero where not.
+    Find clear shifts of the zero of the sensor, one for each record, normalised; 0 if none.
 
-    A model that errs has a mean error, too.  A zero that has moved is one of many times the rest;
-    e is the residual of the model as given without the mean, shape (n,).
+    Any wrong model has some mean error, so a shift must be several times the other error.  e is
+    the residual of the model as given without its mean, shape (n,).
     """
     rms = np.sqrt(means(e * e, rows.of_record))
     return np.where(np.abs(given.offsets) > MOVED_ZERO * rms, given.offsets, 0.0)
 
 
 def _range(simulator: Simulator) -> tuple[float, float]:
-    """Return the voltages between which an H refitted to the rows holds."""
+    """Return the range of voltages in which an H refitted to the rows holds."""
     low, high = simulator.rows.driven
     least, most = simulator.model.scaling.range
-    # plays of larger thresholds than what was driven have no weight any more
+    # plays with thresholds beyond the driven range have no weight any more
     if not simulator.rows.covers((least, most)):
         return low, high
     return min(least, low), max(most, high)
@@ -160,7 +165,7 @@ def _model(
     span: tuple[float, float],
     errors: tuple[Errors, ...],
 ) -> StageModel:
-    """Return the model of a state, in the record that holds the most rows, and its range."""
+    """Build the model of a state, with the parameters of the record that has most rows."""
     rows = simulator.rows
     k = rows.longest
     slim = state.hysteresis.without_idle(NOTHING)
@@ -169,8 +174,8 @@ def _model(
     scaling = model.scaling
     offset = float(state.offsets[k])
     if any(added.name in (DRIFT, WANDERS) for added in state.effects):
-        # a slow drift and an offset make up for one another, and the next record need not drift
-        # like this one: the zero stays where it was
+        # a slow drift and an offset compensate for one another, and the next record may drift
+        # differently: the zero keeps its place
         given = State(simulator.model.hysteresis, np.zeros(len(rows.names)))
         rest = simulator.run(given) - simulator.run(replace(state, effects=kept))
         offset += float(rest[rows.of_record == k].mean())
@@ -188,7 +193,7 @@ def _model(
                     name: float(e.overall)
                     for name, e in zip(('before', 'after'), errors, strict=False)
                 },
-                # of the kind of motion that the model knows least
+                # error on the worst kind of motion
                 **({'worst': float(max(errors[-1].by_segment.values()))} if errors else {}),
             },
         },
@@ -197,7 +202,7 @@ def _model(
 
 
 def _elsewhere(added: Added) -> Added:
-    """Return an effect without what belongs to one record."""
+    """Return an effect without the parameters that only hold in one record."""
     if not added.effect.time_driven:
         return added
     return Added(added.name, tuple(added.effect.elsewhere(values) for values in added.values))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Refits of H, and the walk to the H of the refined model.
+Refit H, and walk to the H of the refined model.
 
-Blocks held out between fitted ones must not choose H: a wide H with a retuned G may leave little
-of them and err widely under other motion.  So the walk begins at the H as it was given, and takes
-a step towards a wider one only where of whole kinds of motion most of the error goes.
+Held-out blocks between fitted blocks must not choose H: a wide H with a retuned G may fit such
+blocks well and err widely under other motion.  The walk therefore begins at the given H.  It takes
+a step to a wider H only if the step removes most of the error on whole kinds of motion.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 
-#: laws of H that are wider than plays: with loops that are not congruent, and with lags, too
+#: laws of H that are wider than plays: one with loops that are not congruent, one with lags, too
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
 
 
@@ -41,11 +41,11 @@ class Step:
     Attributes
     ----------
     way : {'given', 'gain', 'plays', 'drawn', 'wide'}
-        As it was given, with another gain, refitted as plays, wide and drawn to the given one, or
+        The H as given; with another gain; refitted as plays; wide and drawn to the given H; or
         wide.
     fitted : Fitted
     gain : float
-        Gain over that of the given H, where that alone has changed.
+        Gain relative to the given H, if only the gain has changed.
     """
 
     way: str
@@ -55,7 +55,7 @@ class Step:
 
 def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
     """
-    Return H refitted as plays on a fine grid, and as the wider law that leaves less.
+    Refit H as plays on a fine grid, and as the wider law with the smaller error.
 
     A voltage that never moves raises IdentificationError.
     """
@@ -66,13 +66,13 @@ def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
 
 
 def base_thresholds(swing: float) -> np.ndarray:
-    """Return nineteen even thresholds over the swing, and four fine ones near zero."""
+    """Return nineteen even thresholds over the swing, and four fine thresholds near zero."""
     fine = np.array([0.005, 0.012, 0.025, 0.037])
     return swing * np.concatenate([fine, np.arange(1, 20) / 20.0])
 
 
 def refit_of(simulator: Simulator, state: State, name: LawName, goal: float = np.inf) -> Fitted:
-    """Return H refitted as one of a family, G as it is; `goal` as of `fit_jointly`."""
+    """Refit H within a law with an unchanged G; `goal` as in `fit_jointly`."""
     low, high = simulator.rows.reach
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
@@ -80,7 +80,7 @@ def refit_of(simulator: Simulator, state: State, name: LawName, goal: float = np
 
 
 def with_g(simulator: Simulator, fitted: Fitted, goal: float = np.inf) -> Fitted:
-    """Return a fit with G retuned, too; `goal` as of `fit_jointly`."""
+    """Fit again with a retuned G; `goal` as in `fit_jointly`."""
     state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
     return fit_jointly(simulator, state, fitted.base, goal=goal)
 
@@ -92,7 +92,7 @@ def walk(
     best: Candidate | None,
     tick: Callable[[], None],
 ) -> Step:
-    """Return the H of the refined model, beside the effects of the best candidate."""
+    """Choose the H of the refined model, beside the effects of the best candidate."""
 
     def goal() -> float:
         return candidates.noise + TAKES * _left(candidates, last.fitted)
@@ -100,7 +100,7 @@ def walk(
     steps = _steps(simulator, given, candidates, best, tick, goal)
     first = last = next(steps)
     if candidates.rows.passes < PASSES:
-        # a branch that was passed once has no second one to be held out
+        # a branch that was passed once cannot be held out
         return first
     for step in steps:
         tick()
@@ -108,7 +108,7 @@ def walk(
             last = step
     if best is not None:
         return last
-    # a gain is one number
+    # a gain is a single number, so it may replace a refit that is only slightly better
     gain = _other_gain(simulator, first.fitted)
     known, left = (_left(candidates, x.fitted) for x in (first, last))
     is_gain = gain.gain > 0.0 and _left(candidates, gain.fitted) <= min(
@@ -118,7 +118,7 @@ def walk(
 
 
 def _left(candidates: Candidates, fitted: Fitted) -> float:
-    """Return what a fit leaves of whole kinds of motion beyond the noise, a mean square."""
+    """Error of a fit on whole kinds of motion beyond the noise, a mean square."""
     return candidates.beyond_noise(float(fitted.transfer.sum()) / candidates.rows.n)
 
 
@@ -131,11 +131,11 @@ def _steps(
     goal: Callable[[], float],
 ) -> Iterator[Step]:
     """
-    Give one H after the other, each wider than the one before.
+    Yield one H after the other, from the given H to the widest law.
 
-    What cannot leave a mean square as small as the `goal` of the moment is not fitted on.
+    A fit ends early if it cannot reach the mean square `goal`.
     """
-    # the best of a way comes last
+    # the best candidate of each treatment comes last, so it stays in the dictionary
     own = candidates.of(() if best is None else best.effects)[::-1]
     known = {c.way: c.fitted for c in own if not c.retunes}
     retuned = {c.way: c.fitted for c in own if c.retunes}
@@ -156,8 +156,8 @@ def _steps(
 
     laws = WIDE
     if not simulator.rows.kinds:
-        # kinds of motion told apart by the voltage alone do not hold lags along the path, unless
-        # the given H, which came from other motion, holds them back
+        # without labels, the kinds of motion do not determine lags along the path; the given H
+        # came from other motion and holds these lags back
         wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
         drawn = toward_given(simulator, given, wide, tick)
         if drawn is not wide:
@@ -165,7 +165,7 @@ def _steps(
         laws = WIDE[:1]
     wides = [wide_of(name, goal()) for name in laws]
     yield from (Step('wide', wide) for wide in wides)
-    # a change of G that was found is all that there is of it
+    # an effect that changes G leaves nothing for a retuning of G
     wide = min(wides, key=partial(_left, candidates))
     if simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
         known_g = retuned.get('wide')
@@ -175,12 +175,12 @@ def _steps(
 
 
 def law_of(fitted: Fitted) -> LawName:
-    """Return the law of a refitted H; 'any' of an H that stays as it is."""
+    """Return the law of a refitted H; 'any' if H stays as it is."""
     return 'any' if fitted.state.law is None else fitted.state.law.name
 
 
 def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
-    """Return a fit whose H is the same with another gain."""
+    """Fit another gain of an otherwise unchanged H."""
     rows, state = simulator.rows, fitted.state
     x = simulator.bare(state)
     x = x - x.mean()

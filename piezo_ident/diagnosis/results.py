@@ -129,9 +129,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """
-    Error left beyond the noise: share of the explainable error, rms [% of stroke], description.
-    """
+    """Error left beyond the noise: share of the explainable error, rms [% of stroke], text."""
 
     share: float
     rms_percent: float
@@ -299,9 +297,7 @@ class Diagnosis(Showable):
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """
-        Changes from the given to the refined model, in words; empty if the model stays as given.
-        """
+        """Changes from the given to the refined model in words; empty if there are none."""
         return changes(self.given, self.model)
 
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""G times a factor near one, by which a fit may retune it."""
+"""Retune G by a factor near one."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.operators.dynamics import Dynamics
 
-#: corner frequencies of the relaxations that a retuned G may show [Hz]
+#: corner frequencies of the relaxations in a retuned G [Hz]
 RELAXATIONS = (15.0, 100.0)
-#: how far G may be retuned: about samples of delay, their squares, and two relaxations
+#: bounds of the retuning: samples of delay, their squares, and two relaxations (approximate units)
 RETUNING = (20.0, 800.0, 1.0, 1.0)
-#: a retuned G follows its law up to so many times the highest frequency that is driven
+#: a retuned G follows its law up to this multiple of the highest driven frequency
 BEYOND = 4.0
-#: what the product of G and its factor may lose by rounding
+#: largest relative error of the product of G and its factor by rounding
 ROUNDING = 1e-4
 
 
@@ -27,12 +27,12 @@ def retuning_factor(
     retuning: tuple[float, ...], sample_rate: float, band: float = np.inf
 ) -> Dynamics:
     """
-    Return a factor of G near one.
+    Compute the factor of G.
 
-    ``1 + c_1 D + c_2 D^2 + sum_j c_j (1 - z^-1) / (1 - p_j z^-1)`` with p_j the poles of
-    `RELAXATIONS`: a delay, a roll-off, and relaxations.  D is ``1 - z^-1`` up to the band [Hz]
-    that the data drive, and does not grow beyond it, where they say nothing.  It is 1 at rest, and
-    c_1 acts like minus a delay in samples at low frequencies.
+    The factor is ``1 + c_1 D + c_2 D^2 + sum_j c_j (1 - z^-1) / (1 - p_j z^-1)`` with p_j the
+    poles of `RELAXATIONS`: a delay, a roll-off, and relaxations.  D is ``1 - z^-1`` up to the band
+    [Hz].  Beyond this band the data hold no motion, and D stays constant.  The factor is 1 at
+    rest, and c_1 acts like minus a delay in samples at low frequencies.
     """
     c1, c2, c3, c4 = retuning
     D = np.array([1.0, -1.0])
@@ -51,7 +51,7 @@ def retuning_factor(
 
 
 def retuning_terms(sample_rate: float, band: float) -> Array:
-    """Return what the factor holds of each coefficient: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
+    """Filter of each coefficient in the factor: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
     p = _limit(sample_rate, band)
     q, qq = 1.0 - p, (1.0 - p) ** 2
     slow = [(1.0, -1.0, 0.0, a, 0.0) for _, a in _poles(sample_rate)]
@@ -72,9 +72,10 @@ def retuned(
     dynamics: Dynamics, retuning: Sequence[float], sample_rate: float, band: float = np.inf
 ) -> Dynamics:
     """
-    Return G times its factor; G alone where the product of both would lose its digits.
+    Multiply G by its factor; G alone if the product is unstable or loses digits.
 
-    A high order at a high sampling rate leaves few digits for four more poles near 1.
+    The factor adds four poles near 1.  A G of high order at a high sampling rate leaves too few
+    digits for them.
     """
     if not any(retuning):
         return dynamics

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The links of the chain of one run, and the signals between them."""
+"""Run the chain of one run, and keep the signals between its links."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-#: the largest of a derivative, as the small change that a link which bends sees
+#: size of a scaled derivative that passes a nonlinear link, small enough to act as a small change
 SMALL = 1e-6
 
 
 class RunChain:
     """
-    The links of one run, at rest under its first command.
+    Links of one run, at rest under its first command.
 
-    `rests` are the signals at rest before each link and behind the last, and `blocks` those of the
-    run as far as they are kept.
+    `rests` holds the signals at rest before each link and behind the last.  `blocks` holds the
+    signals of the run at these places, if they are kept.
     """
 
     def __init__(self, operators: Sequence[Operator], source: Block) -> None:
@@ -38,7 +38,7 @@ class RunChain:
             self.rests.append(operator.reset(self._u0, self.rests[-1]))
 
     def output(self, *, keep: bool = False) -> Array:
-        """Return the signal behind the last link, and keep those before it if wanted."""
+        """Compute the signal behind the last link; optionally keep the signals before it."""
         block = self.blocks[0]
         for operator in self.operators:
             block = operator.process(block)
@@ -47,24 +47,24 @@ class RunChain:
         return block.x
 
     def behind(self, start: int, m: int) -> Behind:
-        """Return the links from a place on, for small changes, once all blocks are kept."""
+        """Return the links from a place on for small changes; all blocks must be kept."""
         parts = self.operators[start:], self.rests[start:], self.blocks[start:]
         return Behind(*parts, m, small=True)
 
     def filtered(self, place: int, sections: Array, m: int) -> Array:
-        """Return by how much all rows change with filters of what a link takes in."""
+        """Compute the change of all rows if filtered copies of the input of a link are added."""
         behind = self.behind(place + 1, m)
         return behind.filtered(sections, self.blocks[place].x, self.rests[place])
 
     def slopes(self, effect: type[Effect], blocks: Sequence[Block]) -> Mapping[str, Array]:
-        """Return what an effect around H knows of its derivatives, on blocks that were kept."""
+        """Compute the derivatives that an effect around H knows itself, on kept blocks."""
         core = place_of_core(self.operators)
-        # each adds to what H makes of one input, so that none stands behind another
+        # each of these effects adds to H of one input, so no effect follows another
         around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
         return around[0].slopes(blocks[core]) if around else {}
 
     def behind_core(self, slopes: Sequence[Array], blocks: Sequence[Block], m: int) -> list[Array]:
-        """Return the derivatives of all rows from those of what comes out of H."""
+        """Convert derivatives of the output of H to derivatives of all rows."""
         self.blocks = list(blocks)
         behind = self.behind(place_of_core(self.operators) + 1, m)
         if not behind.bends:
@@ -73,15 +73,15 @@ class RunChain:
         return [size * behind.rows(x / size) for x, size in zip(slopes, sizes, strict=True)]
 
     def difference(self, before: RunChain, place: int, m: int) -> Array:
-        """Return by how much all rows differ from a kept chain's, alike but for a link here."""
+        """Compute the change of all rows from a kept chain that differs in the link at `place`."""
         rests, blocks = before.rests[place:], before.blocks[place:]
         if len(self.operators) > len(before.operators):
-            # what was no link let the signal pass
+            # an effect that was absent before had passed the signal
             rests, blocks = [rests[0], *rests], [blocks[0], *blocks]
         core, block = place_of_core(self.operators), blocks[0]
         if place > core:
             return Behind(self.operators[place:], rests, blocks, m, new=True).rows()
-        # what is in front of H, or in it, runs on until it is behind H
+        # links in front of H, and H itself, run until the change is behind H
         for operator in self.operators[place : core + 1]:
             block = operator.process(block)
         k = core + 1 - place
@@ -90,7 +90,7 @@ class RunChain:
 
 
 class _Once(HysteresisOperator):
-    """H, whose last answer is kept: effects around it ask again and again."""
+    """H that keeps its last output, as the effects around it ask for it repeatedly."""
 
     def __init__(self, operator: HysteresisOperator, answer: list[Any]) -> None:
         self.__dict__.update(operator.__dict__)
@@ -98,7 +98,7 @@ class _Once(HysteresisOperator):
 
     def process(self, block: Block) -> Block:
         """Return the block with H applied to its signal."""
-        # read once: another thread may put its own in the place
+        # read once, as another thread may replace the answer
         known = self._answer[0] if self._answer else None
         if known is None or known[0] is not self.hysteresis or known[1] is not block.x:
             known = self.hysteresis, block.x, super().process(block).x
@@ -107,7 +107,7 @@ class _Once(HysteresisOperator):
 
 
 def asked_once(operator: Operator, answer: list[Any]) -> Operator:
-    """Return a link in which H, where the link holds it, keeps its last answer in a list."""
+    """Return a link whose H keeps its last output in a list; a link without H stays unchanged."""
     core = _core(operator)
     if not isinstance(core, HysteresisOperator):
         return operator
@@ -122,10 +122,10 @@ def columns_of(
     chain: RunChain, core: int, law: HysteresisLaw, memory: Array, places: Sequence[int]
 ) -> Iterator[Array]:
     """
-    Give what H, and what effects around it make of it, adds for some of the coefficients.
+    Yield the response of H, with the effects around it, to each of some coefficients.
 
-    Of a chain whose blocks are kept, with H in the place `core`; `memory` and `places` as of
-    `HysteresisLaw.columns`.
+    The blocks of the chain must be kept, with H at the place `core`.  `memory` and `places` are
+    those of `HysteresisLaw.columns`.
     """
     before, rest = chain.blocks[core], chain.rests[core]
     moving = moving_effects(chain.operators[core])
@@ -137,7 +137,7 @@ def columns_of(
 
 
 def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
-    """Return the first link whose output depends on an effect, or on the factor of G."""
+    """Find the first link whose output depends on an effect, or on the factor of G."""
     if effect is None:
         return max(i for i, op in enumerate(operators) if isinstance(op, DynamicsOperator))
     if effect.slot == 'hysteresis':
@@ -145,17 +145,17 @@ def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
     for i in range(len(operators) - 1, -1, -1):
         if type(operators[i]) is effect:
             return i
-    # no link of its own: it is part of the delay
+    # the effect has no link of its own, as it is part of the delay
     return next(i for i, operator in enumerate(operators) if isinstance(operator, DelayOperator))
 
 
 def place_of_core(operators: Sequence[Operator]) -> int:
-    """Return the place of H, and of what is around it."""
+    """Find the link with H and the effects around H."""
     return next(i for i, op in enumerate(operators) if isinstance(_core(op), HysteresisOperator))
 
 
 def effects_around(operator: Operator) -> list[Effect]:
-    """Return the effects around H, the outermost first."""
+    """List the effects around H, the outermost first."""
     found = []
     while isinstance(operator, Effect) and operator.slot == 'hysteresis':
         found.append(operator)
@@ -164,11 +164,11 @@ def effects_around(operator: Operator) -> list[Effect]:
 
 
 def moving_effects(operator: Operator) -> list[Effect]:
-    """Return the effects around H whose part follows from its coefficients."""
+    """List the effects around H whose contribution depends on the coefficients of H."""
     return [effect for effect in effects_around(operator) if effect.of_hysteresis != 'not']
 
 
 def _core(operator: Operator) -> Operator:
-    """Return what effects around H hold, and any other link as it is."""
+    """Return the operator inside the effects around H; another link is returned unchanged."""
     around = effects_around(operator)
     return around[-1].inner if around else operator

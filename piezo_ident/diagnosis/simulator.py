@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The whole model over the rows, run again and again with little changed.
+Run the whole model over the rows, many times with small changes.
 
-Candidates, finite differences and the joint fit all need the prediction with other weights or
-other effects.  What lies before the change in the chain is kept from the run before.
+Candidates, finite differences and the joint fit need the prediction for other weights or other
+effects.  The signals before the changed link are kept from the run before.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
 T = TypeVar('T')
 
-#: runs that go side by side at most
+#: largest number of runs that are computed side by side
 MOST_THREADS = 8
 
 
 class Simulator:
-    """Runs of a model over rows; its G, delay, scaling and effects stay as they are."""
+    """Runs a model over rows; its G, delay, scaling and effects stay fixed."""
 
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model
@@ -62,33 +62,33 @@ class Simulator:
             Block(t=rows.time(i), v=run.u, x=run.u, channels=run.piece.channels)
             for i, run in enumerate(rows.runs)
         ]
-        #: for each run what H made last, and of what
+        #: for each run the last output of H, and its input
         self._answers: list[list[Any]] = [[] for _ in rows.runs]
         self._kept: _Kept | None = None
-        #: what G makes of the columns of the law that was asked for last
+        #: columns of the last law, filtered through G
         self._of_law: tuple[Any, Array] | None = None
-        #: columns of what only adds, and the time constants they were made of
+        #: columns that only add to the displacement, and their time constants
         self._added: tuple[tuple[float, ...], Array] | None = None
-        #: compiled loops leave the interpreter to others, so runs and states go side by side; each
-        #: holds some signals as long as a run
+        #: compiled loops release the interpreter, so runs and states are computed side by side;
+        #: each needs memory for some signals as long as a run
         self._threads = min(MOST_THREADS, os.cpu_count() or 1)
         self._pool = ThreadPoolExecutor(self._threads)
         self._copies: list[Simulator] = []
 
     def copies(self, count: int) -> list[Simulator]:
-        """Return this simulator and others of the same rows, no more than processors."""
+        """Return simulators of the same rows, this one first; at most one for each processor."""
         while len(self._copies) < min(count - 1, self._threads - 1):
             self._copies.append(Simulator(self.model, self.rows))
         return [self, *self._copies[: count - 1]]
 
     def forget(self) -> None:
-        """Give back the room of what is kept from the run before."""
+        """Free the memory of the signals that were kept from the run before."""
         self._kept = None
         for answer in self._answers:
             answer.clear()
 
     def model_of(self, state: State, record: int = 0) -> StageModel:
-        """Return the model of a state, with the effects as in one record."""
+        """Return the model of a state, with the parameters of the effects in one record."""
         settings = [EffectSetting(a.name, a.values[record]) for a in state.effects]
         return replace(
             self.model,
@@ -101,24 +101,24 @@ class Simulator:
 
     @property
     def _band(self) -> float:
-        """What a retuned G does not grow beyond [Hz]."""
+        """Frequency beyond which the retuning of G does not grow [Hz]."""
         return BEYOND * self.rows.highest_frequency
 
     @functools.cached_property
     def is_fast(self) -> bool:
-        """Whether the data are so fast that what G does to them is as large as an effect."""
+        """Whether G and the delay change the signal by as much as an effect."""
         G, delay = self.model.dynamics, self.model.total_delay
         lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
         return self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
 
     def base_columns(self, law: HysteresisLaw) -> Array:
         """
-        Return what G makes of the columns of a law, as rows; shape (size, n).
+        Filter the columns of a law through G, as rows; shape (size, n).
 
-        Effects are left out of these columns: they change them by a few percent, and only the
-        path to the optimum depends on that.
+        Effects are left out of these columns.  Effects change the columns by a few percent, and
+        this only alters the path to the optimum.
         """
-        # the terms of narrower laws are among those of the widest, all but the bias
+        # the widest law contains the terms of all narrower laws except the bias
         wide = law if law.name == 'bias' else replace(law, name=LAWS[-1])
         key = (wide.name, wide.span, tuple(wide.thresholds))
         if self._of_law is None or self._of_law[0] != key:
@@ -128,7 +128,7 @@ class Simulator:
         return whole if law.name == wide.name else whole[law.within(wide)]
 
     def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Array:
-        """Return all rows of some columns of a law in a run."""
+        """Compute the rows of some columns of a law in a run."""
         links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
         source = self._sources[i]
         behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
@@ -137,14 +137,15 @@ class Simulator:
 
     def columns(self, state: State, law: HysteresisLaw, step: float, more: Array) -> Array:
         """
-        Return what the whole chain makes of a step of each coefficient of H; shape (size + k, n).
+        Compute the change of the rows for a step of each coefficient of H; shape (size + k, n).
 
-        Of a state that is remembered, divided by the step; `more`, shape (k, n), stands behind.
+        The state must be remembered.  The changes are divided by the step.  The rows `more`, shape
+        (k, n), are appended.
         """
         chains = self._known(state).chains
 
         def of_run(i: int, places: range) -> Array:
-            # links of its own: another thread may run the same chain
+            # each call builds its own links, as another thread may run the same chain
             chain = self._chain(state, i)
             chain.blocks = chains[i].blocks
             core = place_of_core(chain.operators)
@@ -178,11 +179,11 @@ class Simulator:
         return self._added[1]
 
     def crept(self, state: State) -> Array:
-        """Return what creeps on from before the records in each row; shape (n,)."""
+        """Compute creep from motion before the records in each row; shape (n,)."""
         return self.added_columns(state)[:, state.offsets.size :] @ state.earlier.ravel()
 
     def bare(self, state: State) -> Array:
-        """Return the rows of H, G and the delay alone; shape (n,)."""
+        """Compute the rows of H, G and the delay alone; shape (n,)."""
         G, delay, h = self.model.dynamics, self.model.delay, state.hysteresis
         signals = [
             filter_arx(G.a, G.b, delay.apply(h(run.u, memory(h.thresholds))))
@@ -191,13 +192,13 @@ class Simulator:
         return self.rows.of(signals)
 
     def run(self, state: State) -> Array:
-        """Return the predicted rows; shape (n,)."""
+        """Predict the rows; shape (n,)."""
         if self._kept is not None and self._kept.state is state:
             return self._kept.prediction
         return self._predicted(state, self._of_runs(lambda i: self._chain(state, i).output()))
 
     def full(self, state: State) -> list[Array]:
-        """Return the prediction of each run at the full rate, normalised."""
+        """Predict each run at the full rate, normalised."""
         outputs = self._of_runs(lambda i: self._chain(state, i).output())
         added = state.offsets[self.rows.record]
         if not state.fading:
@@ -208,9 +209,9 @@ class Simulator:
         ]
 
     def remember(self, state: State) -> Array:
-        """Return the predicted rows, and keep what runs between the links."""
+        """Predict the rows, and keep the signals between the links."""
         if self._kept is None or self._kept.state is not state:
-            # gives the room back first
+            # free the memory of the earlier signals first
             self._kept = None
             chains = self._of_runs(lambda i: self._chain(state, i))
             outputs = self._of_runs(lambda i: chains[i].output(keep=True))
@@ -218,7 +219,7 @@ class Simulator:
         return self._kept.prediction
 
     def added(self, effects: Sequence[Added]) -> list[Array | None]:
-        """Return by how much rows of the remembered state change with one more effect each."""
+        """Compute the change of the rows of the remembered state for each added effect."""
         state = self._known().state
         return self.varied([(state.with_effect(added), added.effect, None) for added in effects])
 
@@ -226,10 +227,11 @@ class Simulator:
         self, changes: Sequence[tuple[State, type[Effect] | None, int | None]]
     ) -> list[Array | None]:
         """
-        Return by how much the rows of states differ from those of the remembered one.
+        Compute the difference of the rows of each state from the rows of the remembered state.
 
-        Each differs in one place, an effect or (None) the factor of G, in one record or (None) in
-        all; the chain is only run from there.  None stands for a state that cannot run.
+        Each state differs in one place, an effect or (None) the factor of G, in one record or
+        (None) in all.  The chain runs only from this place on.  The result is None for a state
+        that cannot run.
         """
         chains, runs = self._known().chains, range(len(self._sources))
 
@@ -253,10 +255,11 @@ class Simulator:
 
     def filtered(self, wanted: Sequence[tuple[int | None, str, int, float]]) -> dict[int, Array]:
         """
-        Return derivatives of the rows by those wanted numbers that scale a filter of a signal.
+        Compute derivatives of the rows by the parameters that scale a filter of a signal.
 
-        Of the remembered state, by their place.  Each is an effect's place or (None) the retuning
-        of G, the name of a parameter, the place in a list, and a step.
+        The derivatives belong to the remembered state, and their keys are places in `wanted`.
+        Each entry of `wanted` holds the place of an effect or (None) the retuning of G, the name
+        of a parameter, the index in a vector, and a step.
         """
         kept, rate = self._known(), self.model.sample_rate
         terms = retuning_terms(rate, self._band)
@@ -275,7 +278,7 @@ class Simulator:
             effect = None if i is None else kept.state.effects[i].effect
             steps = np.array([wanted[j][-1] for j in sections])
             stacked = np.stack(list(sections.values()))
-            # the numerators; a link that bends sees a small change
+            # steps scale the numerators, as a link that bends must see a small change
             stacked[:, :3] *= steps[:, None]
             parts = self._of_runs(partial(self._filtered, effect, stacked))
             columns |= dict(zip(sections, self._joined(parts) / steps[:, None], strict=True))
@@ -283,9 +286,10 @@ class Simulator:
 
     def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
         """
-        Return derivatives of the rows by those wanted numbers whose effect knows them itself.
+        Compute derivatives of the rows by the parameters whose effect knows its own derivatives.
 
-        As of `filtered`; each wanted is an effect's place, or None, and the name of a parameter.
+        The result is as in `filtered`.  Each entry of `wanted` holds the place of an effect, or
+        None, and the name of a parameter.
         """
         kept = self._known()
         columns: dict[int, Array] = {}
@@ -316,16 +320,18 @@ class Simulator:
         return chain.filtered(place_of(effect, chain.operators), sections, self.rows.m)
 
     def _of_runs(self, function: Callable[[int], T]) -> list[T]:
-        """Return what a function of the place of a run gives for each."""
+        """Apply a function to the place of each run."""
         return list(self._pool.map(function, range(len(self._sources))))
 
     def _of_columns(
         self, size: int, function: Callable[[int, range], Array], more: Array | None = None
     ) -> Array:
-        """Return the columns that a function of a run and of their places gives, and more."""
+        """
+        Collect columns from a function of a run and of column places, and append more columns.
+        """
         keep = self.rows.keep
         ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
-        # all processors share a run alone; columns that follow each other may run side by side
+        # a single run is shared by all processors; contiguous columns may run side by side
         share = -(-self._threads // len(keep))
         cuts = [size * k // share for k in range(share + 1)]
         tasks = [(i, range(*cut)) for i in range(len(keep)) for cut in itertools.pairwise(cuts)]
@@ -354,7 +360,7 @@ class Simulator:
         return self.rows.of(outputs) + self.added_columns(state) @ state.only_adds
 
     def _joined(self, parts: Sequence[Array]) -> Array:
-        """Return the rows that count of all rows of each run, shape (n // m,) or (k, n // m)."""
+        """Join the rows that count from all rows of each run, shape (n // m,) or (k, n // m)."""
         kept = [
             part if keep.all() else part[..., keep]
             for part, keep in zip(parts, self.rows.keep, strict=True)
@@ -369,7 +375,7 @@ class Simulator:
             asked_once(operator, self._answers[i]) for operator in model.chain(memory).operators
         ]
         if state.retuning:
-            # a link of its own: one filter of so high an order would lose its digits
+            # the factor is a link of its own: one filter of the total order would lose digits
             factor = retuning_factor(state.retuning, model.sample_rate, self._band)
             after = 1 + place_of(None, operators)
             operators.insert(after, DynamicsOperator(factor))
@@ -378,7 +384,7 @@ class Simulator:
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """A state that was run, its chains and rows."""
+    """State that was run, with its chains and rows."""
 
     state: State
     chains: tuple[RunChain, ...]

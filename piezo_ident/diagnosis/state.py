@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a joint fit moves: H, offsets, and effects in a model under study."""
+"""Describe the state of a joint fit: H, offsets, and the effects of a model under study."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from piezo_ident.effects.trials import with_number
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-#: effect that goes on when the motion has ended
+#: effect that continues after the motion has ended
 CREEP = 'creep'
-#: and the one that it looks like beside an H that is no sum of plays
+#: effect that resembles creep beside an H that is not a sum of plays
 DRIFT = 'thermal_drift'
 #: effect that is a gain which changes with time
 WANDERS = 'gain_drift'
-#: effects that have a test of their own, by lines and by coherence with a further channel
+#: effects with tests of their own: lines, and coherence with a further channel
 TESTED = ('periodic_disturbance', 'cross_coupling')
 
 
 @dataclass(frozen=True, eq=False)
 class Added:
     """
-    An effect in the model under study, with its parameters in each record.
+    Effect in the model under study, with its parameters in each record.
 
-    They are the same in all, unless the effect is driven by time.
+    The parameters are the same in all records, unless the effect is driven by time.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Added:
 
     @property
     def effect(self) -> type[Effect]:
-        """Its class."""
+        """Class of the effect."""
         return find_effect(self.name)
 
     def changed(self, record: int | None, name: str, index: int | None, value: float) -> Added:
@@ -61,7 +61,7 @@ class Added:
 @dataclass(frozen=True, eq=False)
 class State:
     """
-    What is fitted: H, the offset of each record, and the effects added.
+    Fitted quantities: H, the offset of each record, and the effects added.
 
     Attributes
     ----------
@@ -70,15 +70,15 @@ class State:
         Added to the displacement, normalised.
     effects : tuple of Added
     retuning : tuple of float
-        Coefficients of `retuned`, empty where G stays as it is.
+        Coefficients of `retuned`; empty if G stays unchanged.
     law : HysteresisLaw or None
-        The family of H; None for an H that is taken as it is.
+        The law of H; None if H stays fixed.
     coefficients : ndarray, shape (size,)
-        Those of the law.
+        Coefficients of H in its law.
     fading : tuple of float
-        Time constants of what creeps on in each record from motion before it [s].
+        Time constants of creep that continues in each record from earlier motion [s].
     earlier : ndarray, shape (records, times)
-        What creeps on as each record begins, of each time constant, normalised.
+        Amplitudes of this creep at the start of each record, for each time constant, normalised.
     """
 
     hysteresis: Hysteresis
@@ -92,30 +92,30 @@ class State:
 
     @property
     def only_adds(self) -> Array:
-        """All that is added to the displacement of records, shape (records (1 + times),)."""
+        """All amplitudes that only add to the displacement, shape (records (1 + times),)."""
         return np.concatenate([self.offsets, self.earlier.ravel()])
 
     def with_only_added(self, values: Array) -> State:
-        """Return the state with other offsets and other creep of earlier motion."""
+        """Return the state with other offsets and other creep from earlier motion."""
         k = self.offsets.size
         return replace(self, offsets=values[:k], earlier=values[k:].reshape(self.earlier.shape))
 
     def with_coefficients(self, law: HysteresisLaw, coefficients: Array) -> State:
-        """Return the state with another H of a family."""
+        """Return the state with another H of a law."""
         theta = np.maximum(coefficients, law.lower)
         return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
 
     def without(self, i: int) -> State:
-        """Return the state without an effect; what creeps on from before goes with creep."""
+        """Return the state without an effect; without creep, earlier creep is removed, too."""
         rest = replace(self, effects=self.effects[:i] + self.effects[i + 1 :])
         return rest.from_rest() if self.effects[i].name == CREEP else rest
 
     def from_rest(self) -> State:
-        """Return the state without what creeps on from before."""
+        """Return the state without creep from earlier motion."""
         return replace(self, fading=(), earlier=np.empty(0))
 
     def with_effects_of(self, other: State) -> State:
-        """Return the state with the effects of another one, and what creeps on in it."""
+        """Return the state with the effects and the earlier creep of another state."""
         return replace(self, effects=other.effects, fading=other.fading, earlier=other.earlier)
 
     def with_effect(self, added: Added) -> State:

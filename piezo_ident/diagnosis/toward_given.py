@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the H as given says of motion that the data do not hold.
+Draw a refitted H to the given H under motion that the data do not hold.
 
-Of records without labels, or of one kind, nothing tells how a refit of H does under other motion.
-The given one came from motion of its own, so it counts as data, too:
+Records without labels, or of one kind of motion, do not test a refitted H under other motion.  The
+given H was identified on other motion, so it counts as data, too:
 
     min  |e|^2 + n mean((h - h_0 - c)^2)
 
-with h and h_0 the new and the given H under loops over the range of the model, n the number of
-rows, and c the mean of the difference, which offsets make up for.  It is enough to keep terms that
-these rows hardly tell from growing, which make up for one another here and nowhere else.  It does
-not count where the data cover a part of the range alone: the refined model holds there only.
+Here h and h_0 are the new and the given H under loops over the range of the model, n is the number
+of rows, and c is the mean difference, which offsets compensate.  This keeps small the terms that
+these rows hardly determine.  Such terms compensate for one another on these rows, but not
+elsewhere.  The given H does not count if the data cover only a part of the range: the refined
+model then holds in this part only.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 
-#: samples of a sweep over the range
+#: number of samples of a sweep over the range
 SWEEP = 60
 
 
@@ -56,7 +57,7 @@ def toward_given(
     fitted: Fitted,
     tick: Callable[[], None] = lambda: None,
 ) -> Fitted:
-    """Return a fit of rows without kinds of motion, drawn towards the H as given."""
+    """Repeat a fit of rows without labelled kinds of motion, drawn to the given H."""
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     if law is None or rows.kinds or not rows.covers(scaling.range):
         return fitted
@@ -66,7 +67,8 @@ def toward_given(
     h = given.hysteresis(u)
     h = h - h.mean()
     P, h = (x / np.sqrt(u.size) for x in (P, h))
-    # as much as the rows: a smaller weight gained more here, and lost more under other motion
+    # equal weight of rows and given H: a smaller weight fitted these rows better and other motion
+    # worse
     weight = float(rows.n)
     A = weight * (P.T @ P)
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The scores of the trials of candidates: what each would gain on data that were not fitted.
+Score the trials of candidates by their gain on held-out data.
 
-A trial switches an effect slightly on.  Its columns are scored by what they gain on held-out
-blocks in addition to all that is in the model already.
+A trial switches an effect slightly on.  Its score is the gain of its columns on held-out blocks,
+beside all other columns of the model.
 """
 
 from __future__ import annotations
@@ -32,32 +32,33 @@ from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
 from piezo_ident.residual.stretches import block_means
 
-#: range of the amplitude that an effect which is either on or off gets in a fit; 1 is exact
+#: accepted range of the fitted amplitude of an effect that is either on or off; 1 is exact
 ON_AMPLITUDE = (0.2, 3.0)
 
-#: called with the share of the work that is done; may raise `Cancelled`
+#: receives the share of the finished work; may raise `Cancelled`
 Tick = Callable[[float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
     """
+    One trial of a candidate and its score.
     One trial of a candidate and what it would gain.
 
     Attributes
     ----------
     effect, trial
     coefficients : ndarray, shape (c,)
-        Steps of its columns that fit best.
+        Steps of the amplitudes, from the least-squares fit.
     errors : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets.
     chance : float
-        Largest gain in the sum of squares of a surrogate.
+        Largest decrease of the sum of squares of a surrogate.
     visible : float
-        Share of its columns that everything else in the model cannot make up for.
+        Share of its columns that the rest of the model cannot imitate.
     is_possible : bool
-        False where the data speak against it: an effect without amplitudes that should come out
-        of the fit about once, and does not.
+        False if the data contradict the trial: an effect without amplitudes must be fitted with an
+        amplitude of about one.
     """
 
     effect: type[Effect]
@@ -76,18 +77,18 @@ class Scored:
 
 class TrialColumns:
     """
-    What trials add to the rows of one state, computed once.
+    Changes of the rows of one state through trials, computed once.
 
-    Beside a sum of plays an effect that is only slightly on adds the same as beside a wide H, but
-    not beside the H as given: there what a backlash adds differs enough to hide it.
+    The columns of a small effect are the same beside a sum of plays and beside a wide H.  They
+    differ beside the H as given: the column of a backlash differs there enough to hide it.
     """
 
     def __init__(self, simulator: Simulator, state: State, lines: Sequence[float]) -> None:
         self.rows = simulator.rows
         self._simulator, self._state = simulator, state
         self._view = _view_of(simulator, lines)
-        #: of an effect, its trials that can run, with the places of their settings, and what each
-        #: setting adds, in half of the room
+        #: for each effect: its trials that can run, with the places of their settings, and the
+        #: change of the rows for each setting, in single precision to save memory
         self._kept: dict[str, tuple[list[tuple[Trial, list[int]]], NDArray[np.float32]]] = {}
 
     def of(
@@ -96,8 +97,8 @@ class TrialColumns:
         """
         Return the trials of an effect with the places of their columns, and all columns.
 
-        Shape (n, c), a column for a step of each amplitude, and of an effect that is driven by
-        time one for each record.  A trial that cannot run on these data is left out.
+        The columns have shape (n, c), one for a step of each amplitude.  An effect driven by time
+        has one column for each record.  A trial that cannot run on these data is left out.
         """
         if effect.name not in self._kept:
             self._kept[effect.name] = self._run(effect, tick)
@@ -167,7 +168,7 @@ def score_trials(
 def best_trials(
     columns: TrialColumns, fitted: Fitted, effects: Sequence[type[Effect]]
 ) -> dict[str, Scored]:
-    """Return the best possible trial of every effect that has one, on the residual of a fit."""
+    """Find the best possible trial of every effect on the residual of a fit."""
     best: dict[str, Scored] = {}
     none = np.zeros((columns.rows.n, 0))
     for scored in score_trials(columns, fitted, effects, none):
@@ -178,7 +179,7 @@ def best_trials(
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
-    """Return the largest share of a column that the first p columns cannot make."""
+    """Largest share of a column that the first p columns cannot imitate."""
     A = equations.A.sum(axis=0)
     shares = []
     for j in range(p, A.shape[0]):
@@ -189,7 +190,7 @@ def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
 
 
 def started(rows: Rows, scored: Scored) -> Added:
-    """Return the effect with the amplitudes of its score, where a joint fit may start."""
+    """Return the effect with the amplitudes of its score, as a start of a joint fit."""
     effect, trial = scored.effect, scored.trial
     added = Added(effect.name, (trial.values,) * len(rows.names))
     known = {p.name: p for p in effect.parameters}
@@ -206,14 +207,14 @@ def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     speeds = []
     channels: dict[str, list[Array]] = {}
     for run in rows.runs:
-        # over a row, so that converter steps do not count as speed
+        # differences over a row, so that converter steps do not count as speed
         speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
         for name, x in run.piece.channels.items():
             channels.setdefault(name, []).append(x)
     speed = np.concatenate(speeds)
     moving = speed[speed > 1e-3 * speed.max(initial=0.0)]
     quantiles = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 0.999])
-    # of all records that have it: the axis may rest in one of them
+    # all records with the channel together, as the axis may rest in one of them
     whole = {name: np.concatenate(parts) for name, parts in channels.items()}
     return View(
         sample_rate=model.sample_rate,

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The verdict: what was found, how sure that is, and what the data cannot tell.
+Judge the decision: the findings, their certainty, and the questions that the data leave open.
 
-A set of effects that leaves little is named, or a class with its rivals; one that leaves more
-explains a part.  Where no set is admissible and another H leaves little of whole kinds of motion,
-that is the finding, and the effects that do nearly as much may hide in it.
+A set of effects that leaves a small error is named; a set with rivals is a class.  A set that
+leaves a larger error explains a part.  If no set is admissible, another H may leave a small error
+on whole kinds of motion.  The refitted H is then the finding, and effects that explain nearly as
+much may hide in it.
 """
 
 from __future__ import annotations
@@ -41,24 +42,25 @@ from piezo_ident.effects import catalogue, find_effect
 @dataclass(frozen=True, eq=False)
 class Findings:
     """
-    The judgement in numbers and names.
+    Judgement in numbers and names.
 
     Attributes
     ----------
     verdict : str
     effects : tuple of str
-        Added, in order.
+        Effects that were added, in order.
     gains : tuple of float
-        The mean square that each of them takes.
+        The mean square that each effect explains.
     group : Class or None
     explainable : float
-        What there was to explain, a mean square: what the best H and G leave without an effect.
+        Error to explain, a mean square: the error of the best H and G without an effect, or of the
+        model as given if an effect has set in.
     share : float
-        Of the explainable part, by everything that was added.
+        Share of the explainable error that everything added explains.
     left : float
-        Beyond the noise, rms in % of stroke.
+        Error left beyond the noise, rms in % of stroke.
     gain : OtherGain or None
-        Where another gain does what a refit of H does.
+        The other gain, if it explains the error as well as a refit of H.
     """
 
     verdict: str
@@ -71,7 +73,7 @@ class Findings:
     gain: OtherGain | None = None
 
     def unexplained(self, description: str) -> Unexplained:
-        """Return what is left beyond the noise."""
+        """Describe the error left beyond the noise."""
         share = 1.0 - self.share if self.effects or self.left else 0.0
         return Unexplained(share, self.left, description)
 
@@ -85,11 +87,11 @@ def judge(
     untried: Collection[str],
 ) -> Findings:
     """
-    Return the verdict on a decision.
+    Judge a decision.
 
-    `last` is where the walk of H ended, `shown` are effects that tests of their own have shown,
-    of which the H that fits best left the mean square `before`, and `untried` those that were no
-    candidates.
+    `last` is the last step of the walk of H.  `shown` holds effects that tests of their own have
+    shown; beside the best H the mean square error without them is `before`.  `untried` holds
+    effects that were no candidates.
     """
     rows, best = candidates.rows, decision.best
     rest, whole = candidates.left_by(last.fitted), decision.whole
@@ -97,7 +99,7 @@ def judge(
         rest = min(rest, candidates.left(best))
     gains = list[float]()
     if shown:
-        # of tests, by the H that fits best
+        # share the gain of effects with their own tests equally, beside the best H
         taken = before - candidates.without().fitted.mean_square
         gains += [max(taken, 0.0) / len(shown)] * len(shown)
         whole = max(whole, before - candidates.noise)
@@ -109,7 +111,7 @@ def judge(
         if candidates.is_part(rest, whole):
             verdict = 'partly_explained'
         gains += [] if best is None else _gains(candidates, best, effects, whole)
-        # H as refitted beside them takes a part, too
+        # the H refitted beside the effects explains a part, too
         times = (whole - rest) / max(sum(gains), 1e-300)
         told = tuple(times * gain for gain in gains)
         return Findings(verdict, effects, told, group, whole, share, candidates.percent(rest))
@@ -128,7 +130,7 @@ def judge(
 
 
 def _in_order(decision: Decision) -> tuple[str, ...]:
-    """Return the names of the best set, as they stand in its fit."""
+    """Return the effects of the best set in the order of its fit."""
     best = decision.best
     if best is None:
         return ()
@@ -138,18 +140,18 @@ def _in_order(decision: Decision) -> tuple[str, ...]:
 def _gains(
     candidates: Candidates, best: Fit, effects: Sequence[str], whole: float
 ) -> Iterator[float]:
-    """Give the mean square that each effect of the best set takes of what is left without it."""
+    """Yield the mean square that each effect of the best set explains beside the others."""
     for name in effects:
         if name in best.effects:
             rest = tuple(x for x in best.effects if x != name)
-            # of a single effect there is nothing else
+            # a single effect has no other effects beside it
             other = candidates.best(rest, best.effects) if rest else None
             level = whole if other is None else candidates.left(other)
             yield max(level - candidates.left(best), 0.0)
 
 
 def _class(names: Sequence[str], untried: Collection[str], effects: Sequence[str]) -> Class | None:
-    """Return what is not separated: rivals, and look-alikes that were no candidates."""
+    """Return the class of rivals, and of look-alikes that were no candidates."""
     of = names[:1] or effects[:1]
     like = [name for one in of for name in look_alikes(one) if name in untried]
     if not names and not like:
@@ -162,7 +164,7 @@ def _class(names: Sequence[str], untried: Collection[str], effects: Sequence[str
 
 
 def _hidden(candidates: Candidates) -> Class | None:
-    """Return the effects that do most of what another H does: it may hold one of them."""
+    """Return effects that do most of the work of another H, as this H may hide one of them."""
     found = [c.effects[0] for c in candidates.like_refit()]
     if len(found) == 1:
         found += [n for n in look_alikes(found[0]) if find_effect(n).rate_independent][:1]
@@ -180,13 +182,13 @@ def candidates_of(
     rounds: Sequence[Round],
     findings: Findings,
 ) -> tuple[Candidate, ...]:
-    """Return every candidate that was not added, its share when added alone, and why not."""
+    """List every candidate that was not added, its share when added alone, and a reason."""
     rows, seen = candidates.rows, visible(rounds)
     group = findings.group.names if findings.group else ()
     found = []
     for name, share in _shares(candidates, rounds).items():
         if name in findings.effects or (seen[name] < SWALLOWED and name not in group):
-            # what these data cannot show is among the untestable
+            # an effect that these data cannot show is listed as untestable
             continue
         found.append(Candidate(name, share, _why_not(name, share, findings, rows.passes)))
     found.sort(key=lambda c: -c.share)
@@ -200,7 +202,7 @@ def candidates_of(
 
 
 def _shares(candidates: Candidates, rounds: Sequence[Round]) -> dict[str, float]:
-    """Return the share of what is left without an effect that each takes when added alone."""
+    """Compute the share of the error without an effect that each effect explains alone."""
     shares: dict[str, float] = {}
     for one in rounds:
         if one.before.state.effects:
@@ -218,7 +220,7 @@ def _shares(candidates: Candidates, rounds: Sequence[Round]) -> dict[str, float]
 
 
 def visible(rounds: Sequence[Round]) -> dict[str, float]:
-    """Return the share of the columns of each candidate that the rest could not make at best."""
+    """Compute the largest share of the columns of each candidate that the rest cannot imitate."""
     found: dict[str, float] = {}
     for one in rounds:
         for name, share in one.visible.items():
@@ -246,9 +248,9 @@ def _why_not(name: str, share: float, findings: Findings, passes: float) -> str:
 
 def smallest_detectable(candidates: Candidates, findings: Findings) -> float | None:
     """
-    Return the size that a further effect must have to be taken, rms in % of stroke.
+    Return the smallest size of a further effect that would be found, rms in % of stroke.
 
-    None where the range was passed so rarely that none is taken.
+    None if the voltage passed its range too rarely for any effect to be found.
     """
     if candidates.rows.passes < PASSES:
         return None
@@ -258,7 +260,7 @@ def smallest_detectable(candidates: Candidates, findings: Findings) -> float | N
 def untestable_of(
     rounds: Sequence[Round], settings: DiagnosisSettings, tested: Collection[str]
 ) -> tuple[Untestable, ...]:
-    """Return the candidates that these data cannot show, but for those `tested` otherwise."""
+    """List the candidates that these data cannot show, except for those `tested` otherwise."""
     names, seen = settings.effects or tuple(catalogue()), visible(rounds)
     return tuple(
         Untestable(name, find_effect(name).needs or 'data in which it shows')
@@ -268,7 +270,7 @@ def untestable_of(
 
 
 def errors_of_laws(candidates: Candidates) -> Mapping[str, float]:
-    """Return how far the laws of H miss kinds of excitation held out, % of stroke."""
+    """Compute the error of each law of H on held-out kinds of excitation, % of stroke."""
     rows = candidates.rows
     return {
         c.fitted.state.law.name: rows.percent(float(c.fitted.transfer.sum()) / rows.n)
