@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the links behind H make of a small change of their signal.
+Pass a small change of a signal through the links of the chain behind H.
 
-Most are linear, or only add something: a change passes them without the signal itself, and many
-columns of a fit pass without a run of the whole chain.
+Most links are linear, or only add to the signal.  Such a link passes a change without the signal
+itself.  Many columns of a fit therefore pass the links without a run of the whole chain.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.residual.stretches import block_means
 
-#: samples that pass all links while they are in the cache, about
+#: approximate number of samples that pass all links together, so that they stay in the cache
 STRETCH = 1 << 14
-#: filters that run side by side in vector lanes
+#: number of filters that run side by side in vector lanes
 LANES = 16
 
 
 class _Link(NamedTuple):
-    """A link that does not pass changes as they are, and its place."""
+    """Link that alters changes, and its place."""
 
     place: int
     operator: Operator
@@ -39,13 +39,13 @@ class _Link(NamedTuple):
 
     @property
     def has_slope(self) -> bool:
-        """Whether a factor of each moment tells what becomes of a change."""
+        """Whether the link multiplies a change by a factor at each sample."""
         return self.kind in ('curved', 'scaled')
 
 
 class Behind:
     """
-    The links of a run behind a place in its chain, and the signal that passes them unchanged.
+    Links of a run behind a place in its chain, with the unchanged signal at each link.
 
     Parameters
     ----------
@@ -53,13 +53,14 @@ class Behind:
     rests : sequence of float
         The signal at rest before each link, and behind the last.
     blocks : sequence of Block
-        The same of the whole run; of links that are all linear the first is enough.
+        The signal of the whole run at the same places.  The first block is enough if all links are
+        linear.
     m : int
         Samples in a row.
     new : bool, optional
-        Whether the first link has changed since.
+        Whether the first link has changed since the blocks were kept.
     small : bool, optional
-        Whether changes are so small that a slope tells what a curve makes of them.
+        Whether changes are so small that the slope of a curve describes its effect on them.
     """
 
     def __init__(
@@ -90,15 +91,15 @@ class Behind:
 
     @property
     def bends(self) -> bool:
-        """Whether a larger change is not just so many times a small one."""
+        """Whether the response to a change is not proportional to the change."""
         return any(link.kind == 'bent' for link in self._links)
 
     def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
         """
-        Return by how much the rows change with the incoming signal; shape (n // m,).
+        Compute the change of the rows from a change of the incoming signal; shape (n // m,).
 
-        The change, shape (n,), is None where only the first link has changed; `rest` is that of
-        the signal at rest, before the first sample.
+        The change, shape (n,), is None if only the first link has changed.  `rest` is the change
+        at rest, before the first sample.
         """
         m, (links, G, slopes) = self._m, self._to_rows
         rest = self._reset(links, rest)
@@ -112,12 +113,12 @@ class Behind:
 
     def filtered(self, sections: Array, signal: Array, rest: float) -> Array:
         """
-        Return by how much the rows change when filters of a signal are added in front.
+        Compute the change of the rows if filtered copies of a signal are added in front.
 
-        Filters may trade places: these run behind those that come first, side by side.
-        `sections`, shape (k, 5), are b_0, b_1, b_2, a_1 and a_2 of each, as of
-        `piezo_ident.operators.dynamics.Dynamics`; `rest` is the signal, shape (n,), at rest.  The
-        result has shape (k, n // m).
+        Linear filters commute, so these filters run side by side, behind the first links that
+        filter.  `sections`, shape (k, 5), holds b_0, b_1, b_2, a_1 and a_2 of each filter, as in
+        `piezo_ident.operators.dynamics.Dynamics`.  `rest` is the value of the signal, shape (n,),
+        at rest.  The result has shape (k, n // m).
         """
         count = len(sections)
         c = np.zeros((5, count + -count % LANES))
@@ -152,10 +153,10 @@ class Behind:
     @cached_property
     def _to_rows(self) -> tuple[Sequence[_Link], RowFilter | None, Array | float]:
         """
-        Links that make samples, a filter that makes rows, and what those are multiplied by.
+        Links that compute samples, a filter that computes rows, and factors of these rows.
 
-        The last links that filter trade places: G, creep and a short delay make rows behind the
-        others.
+        Linear filters commute: the filters among the last links are reordered, so that G, creep
+        and a short delay come last and compute rows only.
         """
         links, end = self._links, len(self._links)
         while end > 0 and links[end - 1].has_slope:
@@ -174,7 +175,9 @@ class Behind:
         return [*links[:last], *others], RowFilter(parts, self._m), self._slopes(links[end:])
 
     def _slopes(self, links: Sequence[_Link]) -> Array | float:
-        """Return the slope of links without memory in each row: it hardly changes within one."""
+        """
+        Compute the mean slope of links without memory in each row; it varies little within a row.
+        """
         product: Array | float = 1.0
         for k, operator, _ in links:
             slope = self._slope(k, operator, slice(self._n))
@@ -184,7 +187,7 @@ class Behind:
     def _slope(
         self, place: int, operator: Operator, cut: slice, signal: float | None = None
     ) -> Array:
-        """Return the slope of a link in a stretch, of its signal or another one."""
+        """Compute the slope of a link in a stretch, at its own signal or at a constant signal."""
         x = self._blocks[place].x[cut]
         if signal is not None:
             x = np.full(x.size, signal)
@@ -197,7 +200,9 @@ class Behind:
         return Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
 
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
-        """Bring links to rest, and return by how much that behind them changes with `rest`."""
+        """
+        Bring links to rest, and return the change at rest behind them for a change `rest` before.
+        """
         v0 = float(self._blocks[0].v[0])
         for k, operator, kind in links:
             if kind == 'curved':
@@ -209,7 +214,7 @@ class Behind:
         return rest
 
     def _passed(self, links: Sequence[_Link], cut: slice, change: Array | None) -> Array:
-        """Return what a change becomes in a stretch; stretches come one after the other."""
+        """Pass a change through links over a stretch; stretches must come in order."""
         block = self._cut(cut)
         if change is not None:
             block = block.with_signal(change)
@@ -229,7 +234,7 @@ class Behind:
 
 
 def _filter_of(operator: Operator) -> Dynamics | Array | None:
-    """Return G, or the filters whose outputs a link adds to its signal; None of another link."""
+    """Return G, or the filters whose outputs a link adds to its signal; None for another link."""
     if isinstance(operator, DynamicsOperator):
         return operator.dynamics
     if not isinstance(operator, Effect) or operator.change != 'filtered':
@@ -244,7 +249,9 @@ def _filter_of(operator: Operator) -> Dynamics | Array | None:
 
 
 def _takes_delay(parts: list[Dynamics | Array], operator: Operator) -> bool:
-    """Put a delay into one of the filters, if it is one and one has the states for it."""
+    """
+    Merge a delay into a filter that has enough states for it; return whether that was possible.
+    """
     if not isinstance(operator, DelayOperator):
         return False
     share = operator.delay.fraction
@@ -260,7 +267,7 @@ def _takes_delay(parts: list[Dynamics | Array], operator: Operator) -> bool:
 
 @kernel
 def _filter_means(x: Array, c: Array, state: Array, m: int, out: Array) -> None:
-    # rows of c: b_0, b_1, b_2, a_1 and a_2; state: two numbers of the transposed direct form
+    # rows of c: b_0, b_1, b_2, a_1 and a_2; state: both numbers of the transposed direct form
     total = np.empty(c.shape[1])
     for row in range(out.shape[1]):
         total[:] = 0.0

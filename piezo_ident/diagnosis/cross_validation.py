@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Cross-validation of a linear model over blocks, from its normal equations.
+Cross-validate a linear model over blocks by its normal equations.
 
-With ``A_k = M_k' M_k``, ``b_k = M_k' e_k`` and ``s_k = e_k' e_k`` of every block k, a set of
-blocks is left out by a subtraction, and its error needs no sample again:
+Each block k has ``A_k = M_k' M_k``, ``b_k = M_k' e_k`` and ``s_k = e_k' e_k``.  A set of blocks is
+left out by a subtraction, and its error follows without the samples:
 
     theta = (sum_train A + D)^-1 sum_train b,     E_k = s_k - 2 b_k' theta + theta' A_k theta.
 """
@@ -20,14 +20,14 @@ from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.rows import Rows
 
-#: share of a column's own energy that is added to the diagonal: keeps collinear columns small
+#: share of a column's own energy that is added to the diagonal: it keeps collinear columns small
 RIDGE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """
-    Normal equations of columns M and one residual or several, block by block.
+    Normal equations of columns M and one or several residuals, block by block.
 
     A, b and s have shapes (blocks, p, p), (blocks, p, k) and (blocks, k).
     """
@@ -37,16 +37,16 @@ class NormalEquations:
     s: Array
 
     def only(self, chosen: Mask | Integers) -> NormalEquations:
-        """Return those of some columns; a mask of shape (p,), or their places."""
+        """Select some columns by a mask of shape (p,), or by their places."""
         return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
 
 
 @dataclass(frozen=True, eq=False)
 class Pull:
     """
-    Normal equations of what is known besides the blocks; s is the sum of squares as it is.
+    Normal equations of information besides the blocks.
 
-    A and b have shapes (p, p) and (p,).
+    A and b have shapes (p, p) and (p,).  s is the present sum of squares.
     """
 
     A: Array
@@ -54,29 +54,29 @@ class Pull:
     s: float
 
     def only(self, chosen: Mask) -> Pull:
-        """Return those of some columns; shape (p,)."""
+        """Select some columns by a mask of shape (p,)."""
         return Pull(self.A[np.ix_(chosen, chosen)], self.b[chosen], self.s)
 
 
 def block_products(rows: Rows, M: Array, N: Array) -> Array:
-    """Return ``M_k' N_k`` of every block; shape (blocks, p, q)."""
+    """Compute ``M_k' N_k`` of every block; shape (blocks, p, q)."""
     return np.stack([M[a:b].T @ N[a:b] for a, b in itertools.pairwise(rows.edges)])
 
 
 def normal_equations(rows: Rows, M: Array, E: Array) -> NormalEquations:
-    """Return the normal equations of columns M, shape (n, p), and residuals E, shape (n, k)."""
+    """Compute the normal equations of columns M, shape (n, p), and residuals E, shape (n, k)."""
     return NormalEquations(block_products(rows, M, M), *right_sides(rows, M, E))
 
 
 def right_sides(rows: Rows, M: Array, E: Array) -> tuple[Array, Array]:
-    """Return b and s of normal equations, of columns M and residuals E."""
+    """Compute b and s of the normal equations of columns M and residuals E."""
     return block_products(rows, M, E), np.add.reduceat(E**2, rows.edges[:-1])
 
 
 def with_columns(
     rows: Rows, equations: NormalEquations, M: Array, C: Array, E: Array
 ) -> NormalEquations:
-    """Return the normal equations of ``[M C]`` from those of M."""
+    """Extend the normal equations of M to ``[M C]``."""
     right = block_products(rows, M, C)
     lower = block_products(rows, C, C)
     A = np.concatenate(
@@ -92,17 +92,17 @@ def with_columns(
 
 def solve(A: Array, b: Array, prior: Array) -> Array:
     """
-    Return the coefficients of a ridge regression; b has shape (p,) or (p, k).
+    Solve a ridge regression for its coefficients; b has shape (p,) or (p, k).
 
-    The prior, shape (p,), is added to the diagonal, besides `RIDGE` of the column's own energy.
+    The diagonal grows by the prior, shape (p,), and by `RIDGE` times each column's own energy.
     Singular equations raise IdentificationError.
     """
-    # of a column that a set holds alone, rounding leaves less than nothing
+    # a column may live in one set alone; rounding then leaves a slightly negative energy
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     size = np.where(size > 0.0, size, 1.0)
     scaled = A / np.outer(size, size)
     scaled[np.diag_indices_from(scaled)] += RIDGE + prior / size**2
-    # columns without any energy stay out
+    # columns without energy get the coefficient 0
     scaled[np.diag_indices_from(scaled)] += np.where(np.diag(A) > 0.0, 0.0, 1.0)
     right = b.T / size
     try:
@@ -115,7 +115,7 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
 
 
 def summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]:
-    """Return the normal equations of all blocks, and of a pull."""
+    """Sum the normal equations of all blocks and of a pull."""
     A, b = equations.A.sum(axis=0), equations.b.sum(axis=0)
     return (A, b) if pull is None else (A + pull.A, b + pull.b[:, None])
 
@@ -124,10 +124,10 @@ def held_out_errors(
     equations: NormalEquations, sets: Integers, prior: Array, pull: Pull | None = None
 ) -> Array:
     """
-    Return the squares of every block, each predicted from other sets; shape (blocks, k).
+    Compute the squared error of every block, predicted from other sets; shape (blocks, k).
 
-    Blocks of one number in `sets`, shape (blocks,), are left out together; prior as in `solve`.
-    The pull never is.
+    Blocks with the same number in `sets`, shape (blocks,), are left out together.  The prior is
+    that in `solve`.  The pull always counts.
     """
     A, b = summed(equations, pull)
     errors = equations.s.copy()
@@ -144,12 +144,12 @@ def held_out_residual(
     rows: Rows, M: Array, e: Array, prior: Array, sets: Integers, pull: Pull | None = None
 ) -> Array:
     """
-    Return the residual of every row, predicted with parameters fitted to other blocks.
+    Compute the residual of every row, predicted with parameters fitted to other blocks.
 
-    M are the derivatives of the prediction and e is the residual of the fit to all rows; blocks of
-    one number in `sets`, shape (blocks,), are left out together.  Near the
-    optimum the model is linear in its parameters, so leaving a set of blocks out moves them by one
-    Gauss-Newton step.
+    M holds the derivatives of the prediction, and e is the residual of the fit to all rows.
+    Blocks with the same number in `sets`, shape (blocks,), are left out together.  Near the
+    optimum the model is linear in its parameters.  Without a set of blocks, the parameters
+    therefore move by one Gauss-Newton step.
     """
     equations = normal_equations(rows, M, e[:, None])
     A, b = summed(equations, pull)

@@ -168,9 +168,7 @@ class Candidates:
         return tuple(sorted(least, key=least.__getitem__))
 
     def is_admissible(self, effects: tuple[str, ...]) -> bool:
-        """
-        Return whether a set is large enough, and each of its effects removes most of the error.
-        """
+        """Return whether a set is large enough, and each of its effects removes most of it."""
         best = self.best(effects)
         if not effects or best is None or self.rows.passes < PASSES:
             return False
@@ -195,9 +193,7 @@ class Candidates:
         return _beyond_chance(best)
 
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
-        """
-        Smallest error of a set plus a change of G that is no larger than the known error of G.
-        """
+        """Smallest error of a set plus a change of G within the known error of G."""
         before, found = self.best(part), math.inf
         for name in (name for name in self._names if change_g([name])):
             other = self.best(tuple(sorted((*part, name))))
@@ -254,7 +250,7 @@ class Decision:
     Attributes
     ----------
     best : Candidate or None
-        None if no set of effects is admissible.
+        The decided candidate; None without an admissible set.
     rivals : tuple of tuple of str
         Sets of the same size that are not separated from the best set, ordered by error.
     names : tuple of str

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-From a model and measured data to the effect that the model lacks.
+Diagnose a model: from measured data to the effect that the model lacks.
 
 1. Faults of the data are found and left out.
-2. H is refitted by free-run error, so that no effect is blamed for a weight of H.
-3. The lines and the noise floor of what is left give what there is to explain.
-4. The candidates are fitted: H and G in each way, with each effect, then with one more
-   (`candidates`, of rounds of `search`).
-5. One ratio decides (`decision`), a walk over whole kinds of motion gives H (`refits`), and the
-   verdict (`verdict`) and the refined model (`refined_model`) say what holds.
+2. H is refitted by the free-run error, so that an error of H is not mistaken for an effect.
+3. The remaining residual gives lines and the noise floor, and thereby the error to explain.
+4. The candidates are fitted: each treatment of H and G, with each effect, then with one more
+   (`candidates`, by rounds of `search`).
+5. One ratio decides (`decision`).  A walk over whole kinds of motion gives H (`refits`).  The
+   verdict (`verdict`) and the refined model (`refined_model`) follow.
 """
 
 from __future__ import annotations
@@ -73,13 +73,14 @@ from piezo_ident.residual import (
     without_lines,
 )
 
-#: effect that is looked for by its lines
+#: effect with a test of its own, by its lines
 HUM = 'periodic_disturbance'
-#: share of the voltage range below which the command is at rest but for noise
+#: share of the voltage range within which the command counts as resting with noise
 TREMBLES = 0.01
-#: share of the variance beyond which the displacement does not follow the voltage
+#: the displacement does not follow the voltage if a larger share of its variance stays unexplained
 UNRELATED = 0.99
-#: correlation with the model below which no change of the stage can be the cause
+#: the displacement runs against the model if their correlation is lower; no change of a stage
+#: causes this
 AGAINST = -0.9
 
 
@@ -121,7 +122,7 @@ def diagnose(
     ]
     if not is_whole:
         warnings.append(part_searched(records, part))
-    # what reading found is told where a record is read
+    # faults found by the reader are reported there, not here
     lost = (
         replace(fault, where=f'in {record.name}, {fault.where}')
         for record, sound in zip(records, measured, strict=True)
@@ -140,10 +141,10 @@ def diagnose(
 
 def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list[Record]:
     """
-    Return the beginnings of records, in proportion to their lengths, `most` samples together.
+    Cut records to their beginnings, in proportion to their lengths, to `most` samples in total.
 
-    A search holds 0.9 to 1.3 kB a sample.  Creep and hysteresis come out of what was before,
-    and only a beginning has nothing before it.
+    A search needs 0.9 to 1.3 kB of memory for each sample.  Creep and hysteresis depend on earlier
+    motion, and only the beginning of a record has none.
     """
     usable = [
         (record, [p for p in record if same_rate(p.sample_rate, model.sample_rate)])
@@ -172,7 +173,7 @@ def _diagnosed(
     progress: Progress,
 ) -> Diagnosis:
     progress('residual', 0.0)
-    # 1. faults of the data
+    # 1.  faults of the data
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     faults = find_faults(_parts(Simulator(model, rows), given))
@@ -184,8 +185,7 @@ def _diagnosed(
         rows = replace(rows, runs=runs, x=rows.of([run.x for run in runs]))
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    # 2. H refitted, as plays and as the widest law
-    # a sensor may have been set to zero again since: an offset of each record is no error
+    # 2. H refitted, as plays and as the widest law; each record has its own offset, which is no error, as the sensor may have been zeroed again
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
     if any(setting.name == CREEP for setting in model.effects):
@@ -193,11 +193,12 @@ def _diagnosed(
         given = with_earlier_motion(simulator, as_given).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
-    # 3. lines and noise of what it leaves
+    # 3.  lines and noise of the residual
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
-    # periods in which a memory settles repeat by less than the noise: no model errs less than that
+    # if H settles slowly, periods of a motion repeat better than the noise suggests; the noise
+    # cannot exceed the smallest error of a model
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
     noise -= excess
     single = None if single is None else single - excess
@@ -215,7 +216,7 @@ def _diagnosed(
         np.random.default_rng(settings.seed),
         lambda share: progress('candidates', share),
     )
-    # another axis makes lines, too: what its model leaves is hum
+    # motion of another axis makes lines, too: the lines left beside its model are hum
     tests = {
         'cross_coupling': any(test.significant for test in channels),
         HUM: bool(lines.lines),
@@ -224,7 +225,7 @@ def _diagnosed(
     candidates = search.of(plays, base, settings.most_effects - len(shown))
     progress('candidates', 1.0)
 
-    # 5. the decision, and what holds
+    # 5.  the decision, the refined model and the verdict
     def tick() -> None:
         progress('verdict', 0.5)
 
@@ -232,7 +233,7 @@ def _diagnosed(
     last = walk(simulator, given, candidates, decision.best, tick)
     untried = set(catalogue()) - set(names) - have
     findings = judge(candidates, decision, last, shown, wide.mean_square, untried)
-    # what single samples have more of noise than rows
+    # noise of single samples that the averaging to rows removes
     lost = 0.0 if single is None else max(single - noise, 0.0)
     without = wide if shown else candidates.without().fitted
     before, refit, after = (
@@ -247,7 +248,7 @@ def _diagnosed(
     if refined.is_given:
         after = before
     smallest = smallest_detectable(candidates, findings)
-    # where no line stands out, and no channel, there is nothing to fit
+    # a search without a line, or without a coherent channel, leaves nothing to fit
     tested = {HUM} if lines.searched else set()
     tested |= {'cross_coupling'} if any(test.tells for test in channels) else set()
     tested |= {*settings.without, *have}
@@ -288,7 +289,7 @@ def _diagnosed(
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
-    """Return the residual of each run [m]; `whole` with what the unknown start still touches."""
+    """Compute the residual of each run [m]; `whole` includes samples after an unknown start."""
     Y = simulator.model.scaling.Y
     return [
         ResidualPart(run.record, run.piece, (run.x - x) * Y, run.use if whole else run.known)
@@ -299,23 +300,23 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
 def _beside_the_drive(
     simulator: Simulator, state: State
 ) -> tuple[tuple[ChannelTest, ...], LineSearch, NoiseFloor]:
-    """Return what further channels and lines a state's residual holds, and the noise without."""
+    """Test a state's residual for further channels and lines, and estimate the remaining noise."""
     parts = _parts(simulator, state)
     channels = channel_tests(parts)
-    # another axis that moves in sines leaves lines, too
+    # another axis that moves in sines causes lines, too
     parts = without_channels(parts, channels)
     found = find_lines(parts, all_stretches(parts))
-    # hum and another axis are no noise: they can be explained
+    # hum and another axis are no noise, as an effect can explain them
     resting = _parts(simulator, state, whole=True)
     quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
     return channels, found, residual_noise_floor(quiet, all_stretches(resting))
 
 
 def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
-    """Refuse displacement that does not follow the voltage: no effect is missing, the stage is."""
+    """Raise IdentificationError if the displacement does not follow the voltage."""
     rows = simulator.rows
     swing = max(float(np.ptp(run.u)) for run in rows.runs)
-    # where the voltage only trembles all else may well be larger
+    # other disturbances may be larger if the voltage only trembles
     if swing <= TREMBLES:
         return
     names = ', '.join(rows.names)
@@ -327,7 +328,7 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
             'was not fitted to; is the sensor connected, and do both columns come from one stage?'
         )
     known, of_each = simulator.run(given), (rows.of_record == k for k in np.unique(rows.of_record))
-    # that the voltage moves is known here
+    # the voltage moves here, so the smallest motion may be zero
     if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, AGAINST):
         raise IdentificationError(f'{names}: {REVERSED}')
 
@@ -339,7 +340,7 @@ def _residuals(
     simulator: Simulator, given: State, without: State, refined: Refined
 ) -> tuple[Residual, ...]:
     Y = simulator.model.scaling.Y
-    # of a refit alone there is no model between the given and the refined one
+    # a refit without effects has no model between the given and the refined one
     is_refit = not refined.is_given and not refined.state.effects
     before = refined.state if is_refit else without
     full = [simulator.full(s) for s in (given, before, refined.state)]

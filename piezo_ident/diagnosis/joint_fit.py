@@ -371,9 +371,7 @@ def _only_adds(state: State, parameter: FreeParameter) -> bool:
 def _moved(
     state: State, parameters: tuple[FreeParameter, ...], step: Array, lower: Array, factor: float
 ) -> State:
-    """
-    Return the state after a step; steps of H are divided by `factor` unless they reach a bound.
-    """
+    """Return the state after a step; `factor` divides steps of H that reach no bound."""
     m, k = state.coefficients.size, state.only_adds.size
     new = state.with_only_added(state.only_adds + step[m : m + k])
     if state.law is not None:

@@ -184,9 +184,7 @@ def _explained(result: Diagnosis) -> str:
 
 
 def _outcome(result: Diagnosis) -> str:
-    """
-    Say whether the model changed, and how its error fell; empty if the model needed no change.
-    """
+    """Say whether the model changed, and how its error fell; may be empty."""
     before, refit, after = (e.overall for e in (result.before, result.refit, result.after))
     if result.changes:
         fall = f'the error on held-out data falls from {before:.3g} to {after:.3g} % of stroke'

@@ -84,9 +84,7 @@ def next_experiment(
 
 
 def _doubts(diagnosis: Diagnosis) -> Iterator[tuple[tuple[str, ...], str, str]]:
-    """
-    Yield doubtful effects, the gravest doubt first; the effect a motion must show ('': any); how.
-    """
+    """Yield effects in doubt, the effect that a motion must show ('': any), and the doubt."""
     alike, untested = 'cannot be separated', 'cannot be tested'
     if diagnosis.group is not None:
         yield diagnosis.group.names, '', alike

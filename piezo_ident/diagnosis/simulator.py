@@ -326,9 +326,7 @@ class Simulator:
     def _of_columns(
         self, size: int, function: Callable[[int, range], Array], more: Array | None = None
     ) -> Array:
-        """
-        Collect columns from a function of a run and of column places, and append more columns.
-        """
+        """Collect columns from a function of a run and of places, and append more columns."""
         keep = self.rows.keep
         ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
         # a single run is shared by all processors; contiguous columns may run side by side

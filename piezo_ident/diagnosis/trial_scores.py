@@ -43,7 +43,6 @@ Tick = Callable[[float], None]
 class Scored:
     """
     One trial of a candidate and its score.
-    One trial of a candidate and what it would gain.
 
     Attributes
     ----------
