@@ -42,8 +42,8 @@ class CandidateSearch:
     """
     Fits the candidates of some data.
 
-    `lines` are the frequencies of lines in the residual [Hz], `noise` is the mean square of the
-    noise of a row, `missed` is the possible error of G (`Candidates.missed`), and `effects` names
+    `lines` are the frequencies of lines in the residual [Hz].  `noise` is the mean square of the
+    noise of a row.  `missed` is the possible error of G (`Candidates.missed`).  `effects` names
     the effects that may be added.
     """
 
@@ -75,7 +75,7 @@ class CandidateSearch:
 
     def shown(self, fitted: Fitted, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
         """
-        Add each effect that a test of its own has shown, and return the fit and their names.
+        Add each effect that a test of its own has shown; return the fit and the added names.
 
         Each such effect must lower the mean square by at least `SMALLEST_EFFECT`, beside the
         effects added before it.

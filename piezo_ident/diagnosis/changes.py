@@ -175,9 +175,7 @@ class Behind:
         return [*links[:last], *others], RowFilter(parts, self._m), self._slopes(links[end:])
 
     def _slopes(self, links: Sequence[_Link]) -> Array | float:
-        """
-        Compute the mean slope of links without memory in each row; it varies little within a row.
-        """
+        """Compute the slope of links without memory in each row; it varies little within a row."""
         product: Array | float = 1.0
         for k, operator, _ in links:
             slope = self._slope(k, operator, slice(self._n))
@@ -200,9 +198,7 @@ class Behind:
         return Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
 
     def _reset(self, links: Sequence[_Link], rest: float) -> float:
-        """
-        Bring links to rest, and return the change at rest behind them for a change `rest` before.
-        """
+        """Bring links to rest; convert the change `rest` before them to the change behind them."""
         v0 = float(self._blocks[0].v[0])
         for k, operator, kind in links:
             if kind == 'curved':
@@ -249,9 +245,7 @@ def _filter_of(operator: Operator) -> Dynamics | Array | None:
 
 
 def _takes_delay(parts: list[Dynamics | Array], operator: Operator) -> bool:
-    """
-    Merge a delay into a filter that has enough states for it; return whether that was possible.
-    """
+    """Merge a delay into a filter with enough states, and return whether that was possible."""
     if not isinstance(operator, DelayOperator):
         return False
     share = operator.delay.fraction

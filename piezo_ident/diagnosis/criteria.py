@@ -17,8 +17,8 @@ from __future__ import annotations
 
 #: smallest size of an effect that is named: real laws differ from textbook laws by about as much
 SMALLEST_EFFECT = 0.05
-#: a change of G must exceed this share of the error of G at its identification, scaled by the
-#: ratio of the fast motion now to the fast motion then: part of that error was small loops, not G
+#: a change of G must exceed the error of G at its identification; if the fast motion has grown,
+#: this error grows by this share of the ratio.  Part of the error was small loops, not G
 IN_PROPORTION = 0.5
 #: the zero of the sensor has moved if the mean error of a record is so many times the other error
 MOVED_ZERO = 3.0

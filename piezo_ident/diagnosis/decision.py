@@ -168,7 +168,7 @@ class Candidates:
         return tuple(sorted(least, key=least.__getitem__))
 
     def is_admissible(self, effects: tuple[str, ...]) -> bool:
-        """Return whether a set is large enough, and each of its effects removes most of it."""
+        """Return whether a set is large enough, and each effect removes most of the error."""
         best = self.best(effects)
         if not effects or best is None or self.rows.passes < PASSES:
             return False
@@ -250,7 +250,7 @@ class Decision:
     Attributes
     ----------
     best : Candidate or None
-        The decided candidate; None without an admissible set.
+        The candidate that was taken; None if no effect was found.
     rivals : tuple of tuple of str
         Sets of the same size that are not separated from the best set, ordered by error.
     names : tuple of str

@@ -173,7 +173,7 @@ def _diagnosed(
     progress: Progress,
 ) -> Diagnosis:
     progress('residual', 0.0)
-    # 1.  faults of the data
+    # 1. faults of the data
     rows = make_rows(model, records)
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     faults = find_faults(_parts(Simulator(model, rows), given))
@@ -185,7 +185,8 @@ def _diagnosed(
         rows = replace(rows, runs=runs, x=rows.of([run.x for run in runs]))
     simulator = Simulator(model, rows)
     progress('residual', 0.5)
-    # 2. H refitted, as plays and as the widest law; each record has its own offset, which is no error, as the sensor may have been zeroed again
+    # 2. H refitted, as plays and as the better of the wide laws
+    # each record has its own offset, as the sensor may have been zeroed again
     shifts = means(rows.x - simulator.run(given), rows.of_record)
     given = replace(given, offsets=shifts)
     if any(setting.name == CREEP for setting in model.effects):
@@ -193,12 +194,12 @@ def _diagnosed(
         given = with_earlier_motion(simulator, as_given).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
-    # 3.  lines and noise of the residual
+    # 3. lines and noise of the residual
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
-    # if H settles slowly, periods of a motion repeat better than the noise suggests; the noise
-    # cannot exceed the smallest error of a model
+    # while a memory settles, periods differ by more than the noise, and the estimated noise is too
+    # large; no model errs by less than the noise, so the smallest error bounds it
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
     noise -= excess
     single = None if single is None else single - excess
@@ -225,7 +226,7 @@ def _diagnosed(
     candidates = search.of(plays, base, settings.most_effects - len(shown))
     progress('candidates', 1.0)
 
-    # 5.  the decision, the refined model and the verdict
+    # 5. the decision, the refined model and the verdict
     def tick() -> None:
         progress('verdict', 0.5)
 
@@ -328,7 +329,7 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
             'was not fitted to; is the sensor connected, and do both columns come from one stage?'
         )
     known, of_each = simulator.run(given), (rows.of_record == k for k in np.unique(rows.of_record))
-    # the voltage moves here, so the smallest motion may be zero
+    # the voltage moves, as checked above, so small motion counts here, too
     if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, AGAINST):
         raise IdentificationError(f'{names}: {REVERSED}')
 

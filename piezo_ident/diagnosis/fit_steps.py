@@ -5,9 +5,8 @@
 Compute the steps of a joint fit: normal equations and damping.
 
 The steps are Gauss-Newton steps with the damping of Levenberg and Marquardt.  The damping follows
-the ratio of the actual gain of a step to its predicted gain: D.  W.  Marquardt, J.  Soc.  Indust.
-Appl.  Math.  11(2), 1963, pp.  431-441,
-doi:10.1137/0111030.
+the ratio of the actual gain of a step to its predicted gain: D. W. Marquardt, J. Soc. Indust.
+Appl. Math. 11(2), 1963, pp. 431-441, doi:10.1137/0111030.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from piezo_ident.diagnosis.cross_validation import block_products, Pull
 from piezo_ident.diagnosis.rows import centred, Rows
 from piezo_ident.fitting.equations import bounded_step
 
-#: factor of the damping after a failed step; each further failure squares the factor
+#: factor of the damping after a failed step; its k-th power after the k-th failure in a row
 WORSE = 3.0
 #: ratios of actual to predicted gain: above the first the damping falls, below the second it grows
 KEPT = (0.75, 0.25)

@@ -45,8 +45,7 @@ FIRM = 0.01
 #: expected size of a weight of H, and of its other coefficients, normalised: the prior that keeps
 #: collinear plays small
 WEIGHT_SPREAD, WIDE_SPREAD = 0.1, 1.0
-#: amplitude error, normalised, whose cost equals that of creep from before a record with the same
-#: ratio: the fit adds (0.003)^2 n times the square of this creep
+#: creep of size d from before a record costs a fit as much as an rms error of this times d
 EARLIER_COST = 0.003
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
@@ -127,7 +126,7 @@ class Fitted:
 
 
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
-    """Refit H within a law while effects stay; the new state and the columns used."""
+    """Refit H within a law while effects stay; return the state and its columns."""
     rows, m = simulator.rows, law.size
     columns, added = simulator.base_columns(law), simulator.added_columns(state)
     base = BaseColumns.of(rows, np.concatenate([columns, added.T]).T)
@@ -271,8 +270,8 @@ def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     """
     Strengthen the prior for parameters that only a left-out kind of excitation determines.
 
-    Example: only a multisine reaches a limit of the slew rate, so the limit is free without it.
-    Creep from earlier motion is determined by the motion at the start of a record alone.
+    Example: only a multisine reaches a limit of the slew rate, so other motion leaves the limit
+    open.  Creep from earlier motion is determined by the motion at the start of a record alone.
     """
     firm = prior.copy()
     firm[_places_of_decays(state)] += rows.n / FIRM

@@ -84,9 +84,9 @@ def free_parameters(
     """
     List every number of the retuning of G and of the effects that the fit may move.
 
-    Some effects contain a change that H can imitate.  If H is free, the fit fixes this change to
-    zero in the record `longest`, so the other records count relative to it.  If H is fixed,
-    `longest` is None and the change is free in all records.
+    H can imitate the first number of some effects (`first_stays`).  If H is free, this number
+    stays fixed in the record `longest`, so other records count relative to it.  If H is fixed,
+    `longest` is None and the number is free in all records.
     """
     found = [
         FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)

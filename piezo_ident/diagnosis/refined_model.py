@@ -87,8 +87,7 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     Return a state in which a wandering gain has the mean of the model as given.
 
     The next record need not have the mean gain of these records.  H was identified at the given
-    gain, and the effects of the model as given contributed to this gain.
-    with the effects that were added, too, as far as they were there.
+    gain, which includes the added effects as far as they already acted then.
     """
     kept = [_elsewhere(added) for added in state.effects]
     if not any(added.name == WANDERS for added in kept):
@@ -111,11 +110,11 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
 
     An effect that the given model lacks can imitate a shift.  Two estimates must therefore agree
     in sign, and the smaller counts: the mean error of the given model, and the displacement at
-    rest relative to the given model.  The effect met during the identification distorts at most
-    one of the two.  The shift must exceed `MOVED_ZERO` times a limit.  The limit is the larger of
-    the remaining error and the expected error of the given model, but at most the error of the
-    given model on this record.  `before` holds the mean squared error of the given model on each
-    record, shape (records,).
+    rest relative to the given model.  An effect that already acted during the identification
+    distorts at most one of the two.  The shift must exceed `MOVED_ZERO` times a limit.  The limit
+    is the larger of the remaining error and the expected error of the given model, but at most the
+    error of the given model on this record.  `before` holds the mean squared error of the given
+    model on each record, shape (records,).
     """
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))

@@ -156,8 +156,8 @@ def _steps(
 
     laws = WIDE
     if not simulator.rows.kinds:
-        # without labels, the kinds of motion do not determine lags along the path; the given H
-        # came from other motion and holds these lags back
+        # kinds of motion without labels leave lags along the path open.  The given H came from
+        # other motion and determines these lags
         wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
         drawn = toward_given(simulator, given, wide, tick)
         if drawn is not wide:

@@ -87,7 +87,7 @@ class FoundEffect:
     """
     Effect that was added to the model, in one of the slots of its chain.
 
-    `share` (0 ..  1) is the part of the explainable error that the effect removes, and
+    `share` (0 .. 1) is the part of the explainable error that the effect removes, and
     `rms_percent` is the rms of this part in % of stroke.
     """
 
@@ -111,7 +111,7 @@ class OtherGain:
     """
     Ratio of the gain of the stage to the gain of the model, and the error that it explains.
 
-    `share` (0 ..  1) is relative to the error of the model as given beyond the noise.
+    `share` (0 .. 1) is relative to the error of the model as given beyond the noise.
     """
 
     value: float
@@ -221,9 +221,8 @@ class Diagnosis(Showable):
     before, refit, after : Errors
         Errors of three models.  `before`: the model as given.  `refit`: the refitted base model,
         on held-out blocks.  `after`: the refined model, on whole held-out kinds of motion.  An
-        effect that depends on time counts in `after` with its parameters in these records, and so
-        does the H refitted with it, although the refined model omits such an effect and this H if
-        nothing else was found.
+        effect that depends on time counts in `after` with its parameters in these records.  So
+        does the H refitted with it.  The refined model omits both if nothing else was found.
     noise_floor : float or None
         Rms of single samples, % of stroke.
     noise_source : str

@@ -7,8 +7,8 @@ Filter through G, creep in front of G and a short delay, and compute means of ro
 A fit mostly needs means of the output of G over rows of some samples.  The state of G therefore
 steps from one group of rows to the next.  A product of matrices adds the contribution of the
 samples in between.  This takes about half the time of a filter that computes every sample.  Such a
-system is called lifted; see P.  P.  Khargonekar, K.  Poolla and A.  Tannenbaum, IEEE Trans.
-Autom.  Control 30(11), 1985, pp.  1088-1096, doi:10.1109/TAC.1985.1103841.
+system is called lifted; see P. P. Khargonekar, K. Poolla and A. Tannenbaum, IEEE Trans.
+Autom. Control 30(11), 1985, pp. 1088-1096, doi:10.1109/TAC.1985.1103841.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy.linalg import block_diag
 LEAST_IN_ROW, LEAST_IN_RUN = 3, 100_000
 #: approximate number of samples in a group of rows
 IN_GROUP = 48
-#: largest share of the output that eq.  (5) may lose by rounding: powers of A lose far more
+#: largest share of the output that eq. (5) may lose by rounding: powers of A lose far more
 LOST = 1e-12
 
 

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records as rows of a regression, cut into blocks that can be held out.
+Cut records into rows of a regression, and into blocks that can be held out.
 
-A row is the mean over a few neighbouring samples, so that a minute at 20 kHz stays a small matrix.
-The model runs at the full rate before it is averaged, so nothing is aliased.
+A row is the mean of a few neighbouring samples, so a minute at 20 kHz stays a small matrix.  The
+model runs at the full rate and is averaged afterwards, so rows of model and data are averaged
+alike.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from piezo_ident.residual.stretches import block_means
 
 #: share of the model's voltage range that data must cover for a refitted H to hold in all of it
 COVERED = 0.95
-#: rows a second that keep what steps and noise excite, and the most rows altogether
+#: rows per second, enough for the motion that steps and noise excite, and the most rows in total
 ROW_RATE, MOST_ROWS = 5000.0, 200_000
-#: fewest rows that can be cut into blocks
+#: smallest number of rows that can be cut into blocks
 FEWEST = 500
-#: blocks altogether, about, and how many sets of them are held out in turn
+#: approximate number of blocks, and number of sets of blocks that are held out in turn
 BLOCKS, FOLDS = 80, 5
 
 Memory = Callable[[Array], Array]
@@ -46,7 +47,7 @@ Memory = Callable[[Array], Array]
 @dataclass(frozen=True, eq=False)
 class Rows:
     """
-    Records ready for a regression.
+    Records, prepared for a regression.
 
     Attributes
     ----------
@@ -57,30 +58,29 @@ class Rows:
     names : tuple of str
         Names of the records.
     begin : ndarray, shape (runs,)
-        When the record of each run began [s]: what drifts began with it, whatever its clock was
-        set to.  Zero where an effect of the model follows time already, which it does by the
-        clock.
+        Start of the record of each run [s], as a drift begins with the record, whatever its clock
+        was set to.  Zero if an effect of the model already depends on the time of the clock.
     duration : float
-        From the start of a record to its end, of the longest one [s].
+        Time from start to end of the longest record [s].
     memories : tuple of callable
         Play outputs at the start of each run, as a function of the thresholds.
     m : int
         Samples in a row.
     keep : tuple of ndarray of bool
-        For each run, which rows count: most of their samples sound, and all but wide plays off
-        their start.
+        For each run, the rows that count.  Most samples of such a row are sound, and the unknown
+        start no longer affects it, except through wide plays.
     x : ndarray, shape (n,)
         Measured displacement of the rows, normalised.
     block, of_record : ndarray of int, shape (n,)
         Block and record of each row.
     fold, group : ndarray of int, shape (blocks,)
-        Which blocks are held out together: spread over all data, and whole stretches of a kind.
+        Numbers of blocks that are held out together: spread over all data, or as kinds of motion.
     label : tuple of str
         Segment label of each block.
     labels : tuple of str
         Name of each group.
     stroke : float
-        Largest minus smallest displacement of a record, the largest of all, normalised.
+        Largest range of the displacement in a record, normalised.
     """
 
     runs: tuple[Run, ...]
@@ -107,12 +107,12 @@ class Rows:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of motion held out in turn; empty where parts of the data stand for them."""
+        """Kinds of motion that are held out in turn; empty if parts of the data replace them."""
         return () if are_parts(self.labels) else self.labels
 
     @functools.cached_property
     def highest_frequency(self) -> float:
-        """The frequency below which all but a millionth of the moving power of any run lies."""
+        """Frequency below which all but a millionth of the moving power of each run lies [Hz]."""
         found = [0.0]
         for run, keep in zip(self.runs, self.keep, strict=True):
             if (rows := np.flatnonzero(keep)).size:
@@ -122,39 +122,41 @@ class Rows:
 
     @functools.cached_property
     def reach(self) -> tuple[float, float]:
-        """The lowest and the highest command, normalised."""
+        """Lowest and highest command, normalised."""
         return _extremes([run.u for run in self.runs])
 
     @functools.cached_property
     def driven(self) -> tuple[float, float]:
-        """The lowest and the highest voltage [V]."""
+        """Lowest and highest voltage [V]."""
         return _extremes([run.piece.v for run in self.runs])
 
     def covers(self, span: Sequence[float]) -> bool:
-        """Return whether they were driven over enough of a span [V] for H to hold in all of it."""
+        """Return whether the voltage covers enough of a span [V] for H to hold in all of it."""
         low, high = self.driven
         return high - low >= COVERED * (span[1] - span[0])
 
     def leaves(self, span: Sequence[float]) -> bool:
-        """Return whether they were driven so far out of a span [V] that H is unknown there."""
+        """Return whether the voltage leaves a span [V] so far that H is unknown there."""
         (low, high), (least, most) = self.driven, span
         return most - least < COVERED * (max(high, most) - min(low, least))
 
     @property
     def passes(self) -> float:
-        """How often the command passed over its range, there or back."""
+        """Number of passes of the command over its range, in either direction."""
         low, high = self.reach
-        # over rows, so that converter steps and noise are no travel
+        # rows instead of samples, so that converter steps and noise do not count as travel
         travel = sum(float(np.abs(np.diff(block_means(run.u, self.m))).sum()) for run in self.runs)
         return travel / (high - low) if high > low else 0.0
 
     def time(self, i: int) -> Array:
-        """Return the time of the samples of a run since its record began [s]."""
+        """Compute the time of the samples of a run since the start of its record [s]."""
         run = self.runs[i]
         return run.piece.time(0, run.u.size) - float(self.begin[i])
 
     def fading(self, i: int, times: Sequence[float]) -> Array:
-        """Return decays with some time constants [s] of a run; 1 until its record counts."""
+        """
+        Compute decays with time constants [s] over a run; 1 until the first row of its record.
+        """
         run = self.runs[i]
         begin, _ = self._counted.get(int(self.record[i]), (0.0, 0.0))
         t = np.maximum(run.piece.time(0, run.u.size) - begin, 0.0)
@@ -162,24 +164,24 @@ class Rows:
 
     @property
     def judged(self) -> float:
-        """From the first row to the last of a record, of the longest one [s]."""
+        """Longest time from the first row to the last row of a record [s]."""
         return max(end - begin for begin, end in self._counted.values())
 
     @property
     def first(self) -> float:
-        """When the first row of the record that has most comes, by the clock of `time` [s]."""
+        """Time of the first row of the record with most rows, on the clock of `time` [s]."""
         begin = float(self.begin[list(self.record).index(self.longest)])
         return self._counted[self.longest][0] - begin
 
     @property
     def last(self) -> float:
-        """When the last record ends, by the clock of `time` [s]."""
+        """Latest end of a record, on the clock of `time` [s]."""
         ends = [run.piece.start_time + run.piece.duration for run in self.runs]
         return float((np.array(ends) - self.begin).max())
 
     @functools.cached_property
     def _counted(self) -> dict[int, tuple[float, float]]:
-        """When the rows of each record begin and end [s]."""
+        """First and last time of the rows of each record [s]."""
         found: dict[int, list[float]] = {}
         for run, keep, k in zip(self.runs, self.keep, self.record, strict=True):
             t = run.piece.start_time + np.flatnonzero(keep) * self.m / run.piece.sample_rate
@@ -188,7 +190,7 @@ class Rows:
 
     @property
     def longest(self) -> int:
-        """Number of the record that has most rows."""
+        """Number of the record with most rows."""
         return int(np.bincount(self.of_record, minlength=len(self.names)).argmax())
 
     @functools.cached_property
@@ -198,18 +200,19 @@ class Rows:
         return np.append(starts, self.n)
 
     def percent(self, mean_square: float) -> float:
-        """Return a mean square, normalised, as rms in % of stroke."""
+        """Convert a normalised mean square to rms in % of stroke."""
         return percent(np.sqrt(max(mean_square, 0.0)), self.stroke)
 
     def square(self, size: float) -> float:
-        """Return an rms in % of stroke as a mean square, normalised."""
+        """Convert an rms in % of stroke to a normalised mean square."""
         return (size * self.stroke / 100.0) ** 2
 
     def errors(self, e: Array, noise: float) -> Errors:
         """
-        Return the errors of a residual of the rows, shape (n,), normalised.
+        Compute the errors of a normalised residual of the rows, shape (n,).
 
-        `noise` is the mean square that averaging took out of rows, and that single samples have.
+        `noise` is the mean square of the noise of single samples that the averaging to rows
+        removed.
         """
 
         def error(part: Array) -> float:
@@ -229,18 +232,18 @@ class Rows:
         return Errors(error(e), by_segment, by_frequency)
 
     def of(self, signals: Sequence[Array]) -> Array:
-        """Return the rows, shape (n,), of signals given at the full rate, one a run."""
+        """Convert signals at the full rate, one for each run, to rows; shape (n,)."""
         parts = [block_means(x, self.m)[keep] for x, keep in zip(signals, self.keep, strict=True)]
         return np.concatenate(parts)
 
 
 def centred(x: Array, of_record: Integers) -> Array:
-    """Return rows without the mean of the record that each belongs to."""
+    """Subtract from rows the mean of their record."""
     return np.asarray(x - means(x, of_record)[of_record])
 
 
 def means(x: Array, of_record: Integers) -> Array:
-    """Return the mean of the rows of each record; shape (records,)."""
+    """Compute the mean of the rows of each record; shape (records,)."""
     return np.asarray(np.bincount(of_record, x) / np.bincount(of_record))
 
 
@@ -250,8 +253,8 @@ def make_rows(
     """
     Cut records into rows and blocks, by the scaling and sampling rate of a model.
 
-    `bad` are for each run samples that are not used.  IdentificationError when no record
-    has the sampling rate of the model, or nothing is left to judge.
+    `bad` marks for each run samples that are not used.  Raises IdentificationError if no record
+    has the sampling rate of the model, or if too few rows can be judged.
     """
     runs = runs_of(records, model.sample_rate, model.scaling, SWEPT)
     if not runs:
@@ -323,20 +326,20 @@ def make_rows(
 
 
 def _has_clock(model: StageModel) -> bool:
-    """Return whether an effect of the model does more than it would in any other record."""
+    """Return whether the model holds time-driven parameters that only apply to one record."""
     found = [(find_effect(setting.name), setting.parameters) for setting in model.effects]
     return any(e.time_driven and not e.same(values, e.elsewhere(values)) for e, values in found)
 
 
 def _whole_rows(known: Mask, m: int) -> Mask:
-    """Return which rows of m samples count: a few lost ones may be no more than half of a row."""
+    """Select the rows of m samples that count: at most half of a row may be filled gaps."""
     both = (x[: x.size // m * m].reshape(-1, m) for x in (known, closed(known, FEW)))
     counts, whole = (x.sum(axis=1) for x in both)
     return np.asarray((whole == m) & (2 * counts >= m))
 
 
 def _blocks_of(runs: Sequence[Run], keep: Sequence[Mask], m: int, block: Integers) -> list[Array]:
-    """Return the command of each block, means over rows."""
+    """Return the command of each block, as means over rows."""
     u = np.concatenate([block_means(r.u, m)[good] for r, good in zip(runs, keep, strict=True)])
     return np.split(u, np.flatnonzero(np.diff(block)) + 1)
 
@@ -348,7 +351,7 @@ def _memory(model: StageModel, run: Run, at_rest: bool) -> Memory:
         return lambda r: initial_memory(u0, r)
     at = np.concatenate([[0.0], model.hysteresis.thresholds])
     value = np.concatenate([[u0], np.asarray(start.memory)[: at.size - 1]])
-    # a play output falls by at most its threshold; between known ones it is interpolated
+    # a play output falls by at most its threshold; thresholds between known plays are interpolated
     return lambda r: np.clip(np.interp(r, at, value), u0 - r, u0)
 
 

@@ -50,9 +50,8 @@ WORTH_END = 0.5
 #: number of trials of a candidate that start a joint fit, iterations of this fit, and number of
 #: candidates of a round that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: largest ratio of the error of a trial beside a sum of plays to the error before, for the trial
-#: to be a start; and ratios of errors beyond which another start, or another candidate, can no
-#: longer become the best
+#: a trial beside a sum of plays is a start up to the first multiple of the error before; another
+#: start, and another candidate, is given up beyond the second and third multiple of the best error
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end if its error is at most this factor times the error of
 #: the last of the `FINAL` candidates
@@ -202,7 +201,7 @@ def _contenders(
     tick: Tick,
 ) -> tuple[list[Fitted], list[str]]:
     """
-    Fit the candidates jointly; those that show, the best first, and warnings of failed fits.
+    Fit the candidates jointly; return those that show, the best first, and warnings.
 
     A fit ends early if it cannot reach the mean square `worth`.
     """
@@ -216,8 +215,8 @@ def _contenders(
     for i, (effect, states) in enumerate(starts):
         at = 0.5 + 0.5 * i / len(starts)
         alive()
-        # a candidate with a small share of the best gain is rarely among the candidates fitted to
-        # the end; a candidate with almost no error has no rivals
+        # a candidate with a small share of the best gain is rarely fitted to the end.  If the best
+        # error is below the noise, only candidates with a similar error are its rivals
         goal = min(worth, before.mean_square - WORTH_END * (before.mean_square - least))
         if least < done:
             goal = min(goal, FORM_RATIO * least + done)
@@ -267,7 +266,7 @@ def fit_starts(
     tick: Callable[[], None],
 ) -> list[Fitted | Failure]:
     """
-    Fit each state, several at a time; the fits, or the error of each failed fit.
+    Fit each state, several at a time; return each fit, or the error of a failed fit.
 
     `fit` receives a simulator of its own, a state, and a function that it must call between its
     steps.  Meanwhile this thread alone calls `tick`, which may raise `Cancelled`.

@@ -9,9 +9,9 @@ given H was identified on other motion, so it counts as data, too:
 
     min  |e|^2 + n mean((h - h_0 - c)^2)
 
-Here h and h_0 are the new and the given H under loops over the range of the model, n is the number
-of rows, and c is the mean difference, which offsets compensate.  This keeps small the terms that
-these rows hardly determine.  Such terms compensate for one another on these rows, but not
+Here h and h_0 are the new and the given H under loops over the range of the model.  n is the
+number of rows.  c is the mean difference, which offsets compensate.  The given H keeps terms small
+that these rows hardly determine.  Such terms compensate for one another on these rows, but not
 elsewhere.  The given H does not count if the data cover only a part of the range: the refined
 model then holds in this part only.
 """
