@@ -154,9 +154,7 @@ class Rows:
         return run.piece.time(0, run.u.size) - float(self.begin[i])
 
     def fading(self, i: int, times: Sequence[float]) -> Array:
-        """
-        Compute decays with time constants [s] over a run; 1 until the first row of its record.
-        """
+        """Compute decays with time constants [s] over a run; 1 until its record has rows."""
         run = self.runs[i]
         begin, _ = self._counted.get(int(self.record[i]), (0.0, 0.0))
         t = np.maximum(run.piece.time(0, run.u.size) - begin, 0.0)
