@@ -40,7 +40,7 @@ Tick = Callable[[float], None]
 
 class CandidateSearch:
     """
-    Fits the candidates of some data.
+    Search that fits the candidates of some data.
 
     `lines` are the frequencies of lines in the residual [Hz].  `noise` is the mean square of the
     noise of a row.  `missed` is the possible error of G (`Candidates.missed`).  `effects` names

@@ -113,11 +113,11 @@ class Candidates:
         return NOISE_SHARE * self.noise
 
     def left(self, candidate: Candidate) -> float:
-        """Error of a candidate beyond the noise, a mean square."""
+        """Compute the error of a candidate beyond the noise, a mean square."""
         return self.left_by(candidate.fitted)
 
     def left_by(self, fitted: Fitted) -> float:
-        """Error of a fit beyond the noise, a mean square."""
+        """Compute the error of a fit beyond the noise, a mean square."""
         error = np.sqrt(fitted.errors.sum() * fitted.transfer.sum()) / self.rows.n
         return self.beyond_noise(float(error))
 
@@ -126,7 +126,7 @@ class Candidates:
         return max(square - self.noise, 0.0) + self.least_share
 
     def _of_blocks(self, candidate: Candidate) -> float:
-        """Error beyond the noise on blocks held out in spread sets alone."""
+        """Compute the error beyond the noise on blocks held out in spread sets alone."""
         return self.beyond_noise(candidate.fitted.mean_square)
 
     def percent(self, left: float) -> float:
@@ -193,7 +193,7 @@ class Candidates:
         return _beyond_chance(best)
 
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
-        """Smallest error of a set plus a change of G within the known error of G."""
+        """Compute the least error of a set plus a change of G within the known error of G."""
         before, found = self.best(part), math.inf
         for name in (name for name in self._names if change_g([name])):
             other = self.best(tuple(sorted((*part, name))))
@@ -208,7 +208,7 @@ class Candidates:
         return {name for c in self.all for name in c.effects}
 
     def _as_given(self, effects: tuple[str, ...]) -> float:
-        """Error of the model with the H as given."""
+        """Compute the error of the model with the H as given."""
         return min(self.left(c) for c in self.of((), effects) if c.way == 'given')
 
     @property

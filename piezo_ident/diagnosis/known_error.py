@@ -16,11 +16,11 @@ from piezo_ident.model.stage_model import StageModel
 
 
 def missed_then(model: StageModel) -> float:
-    """Return the error of the model on fast motion at its identification, % of stroke; else 0."""
+    """Return the error on fast motion at the identification [% of stroke]; 0 if unknown."""
     known = _entries(model, 'errors')
     if 'fast_motion' in known:
         known = {'fast_motion': known['fast_motion']}
-    # an older file only holds the error on all motion
+    # a file without this entry holds the error on all motion
     return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
 
 

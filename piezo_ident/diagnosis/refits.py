@@ -118,7 +118,7 @@ def walk(
 
 
 def _left(candidates: Candidates, fitted: Fitted) -> float:
-    """Error of a fit on whole kinds of motion beyond the noise, a mean square."""
+    """Compute the error of a fit on whole kinds of motion beyond the noise, a mean square."""
     return candidates.beyond_noise(float(fitted.transfer.sum()) / candidates.rows.n)
 
 
@@ -156,8 +156,8 @@ def _steps(
 
     laws = WIDE
     if not simulator.rows.kinds:
-        # kinds of motion without labels leave lags along the path open.  The given H came from
-        # other motion and determines these lags
+        # kinds of motion without labels do not restrain lags along the path.  The given H came
+        # from other motion, so a law with lags is only tried drawn to the given H
         wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
         drawn = toward_given(simulator, given, wide, tick)
         if drawn is not wide:

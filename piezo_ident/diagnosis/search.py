@@ -333,7 +333,7 @@ def _to_the_end(
 
 
 def gains_of(rows: Rows, this: Round) -> dict[str, float]:
-    """Mean square that each candidate of a round gains in its trial or in its joint fit."""
+    """Compute the mean square that each candidate gains, in its trial or in its joint fit."""
     total = float(this.before.errors.sum())
     gains = {name: (total - s.error) / rows.n for name, s in this.best.items()}
     for c in this.contenders:

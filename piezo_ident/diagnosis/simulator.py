@@ -53,7 +53,7 @@ MOST_THREADS = 8
 
 
 class Simulator:
-    """Runs a model over rows; its G, delay, scaling and effects stay fixed."""
+    """Simulation of a model over rows; its own G, delay, scaling and effects stay fixed."""
 
     def __init__(self, model: StageModel, rows: Rows) -> None:
         self.model = model

@@ -178,7 +178,7 @@ def best_trials(
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
-    """Largest share of a column that the first p columns cannot imitate."""
+    """Compute the largest share of a column that the first p columns cannot imitate."""
     A = equations.A.sum(axis=0)
     shares = []
     for j in range(p, A.shape[0]):
