@@ -40,7 +40,8 @@ DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 POOR = 2
 #: lowest ratio of a gain to the gain before, as assumed for the forecast of future gains
 LEAST_RATIO = 0.5
-#: share of the energy of a parameter's column that other kinds of excitation must hold
+#: share of the energy of a parameter's column that other kinds of excitation must hold to
+#: determine the parameter
 FIRM = 0.01
 #: expected size of a weight of H, and of its other coefficients, normalised: the prior that keeps
 #: collinear plays small

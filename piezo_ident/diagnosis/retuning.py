@@ -51,7 +51,7 @@ def retuning_factor(
 
 
 def retuning_terms(sample_rate: float, band: float) -> Array:
-    """Return the filter of each coefficient in the factor: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
+    """Return the filter of each coefficient: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
     p = _limit(sample_rate, band)
     q, qq = 1.0 - p, (1.0 - p) ** 2
     slow = [(1.0, -1.0, 0.0, a, 0.0) for _, a in _poles(sample_rate)]

@@ -54,7 +54,8 @@ class Findings:
     group : Class or None
     explainable : float
         Error to explain, a mean square: the error of the best H and G without an effect, or of the
-        model as given if an effect has set in.
+        model as given if an effect has set in.  With effects of tests of their own, it is at least
+        the error of the best H without them.
     share : float
         Share of the explainable error that everything added explains.
     left : float
