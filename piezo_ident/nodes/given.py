@@ -92,6 +92,10 @@ class _Together(ParameterService):
         return response
 
 
+#: the choice of a parameter that switches off
+OFF = 'off'
+
+
 class ParameterNode(Node):
     """
     Node that declares its parameters by `Declaration`, and checks them together.
@@ -128,6 +132,8 @@ class ParameterNode(Node):
         descriptor = ParameterDescriptor(
             description=f'{declaration.description}{unit}{choices}',
             read_only=declaration.read_only,
+            # a file or command line may say a bare off, which YAML reads as false
+            dynamic_typing=OFF in declaration.choices,
         )
         if declaration.low is not None and declaration.high is not None:
             low, high = declaration.low, declaration.high
@@ -140,8 +146,11 @@ class ParameterNode(Node):
                     IntegerRange(from_value=int(low), to_value=int(high), step=1)
                 ]
         value = list(default) if isinstance(default, tuple) else default
-        parameter = self.declare_parameter(declaration.name, value, descriptor)
         self._declared[declaration.name] = declaration
+        parameter = self.declare_parameter(declaration.name, value, descriptor)
+        if (spelt := self._spelt(parameter)) is not parameter:
+            super().set_parameters_atomically([spelt])
+            parameter = spelt
         self.wanted = {**self.values, declaration.name: parameter.value}
         problem = self._problem(declaration.name, parameter.value)
         if problem:
@@ -191,7 +200,15 @@ class ParameterNode(Node):
             self.journal.tell(f'parameter refused: {results[k].reason}', DiagnosticStatus.WARN)
         return [results[k] for k in range(len(parameter_list))]
 
+    def _spelt(self, parameter: Parameter) -> Parameter:
+        """Convert a false to the choice off: YAML reads a bare off as false."""
+        declaration = self._declared.get(parameter.name)
+        if declaration and OFF in declaration.choices and parameter.value is False:
+            return Parameter(parameter.name, Parameter.Type.STRING, OFF)
+        return parameter
+
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        parameters = [self._spelt(p) for p in parameters]
         # a loaded file also names the read-only parameters
         wanted = [
             p

@@ -44,10 +44,13 @@ def whole(tmp_path_factory):
             ('excitation', {'subscribers': 3, 'block_size': 500}),
             ('stage', {'seed': 3}),
             ('identifier', {**QUICK, 'program': PROGRAM}),
-            ('model', {'window': 0.5, 'observe_gain': True}),
+            ('model', {'window': 0.5, 'observe_gain': True, 'adapt': 'hysteresis'}),
             ('recorder', {'output': str(folder / 'bag')}),
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
-            ('feedforward', {'silence': 0.2, 'ramp_slew': 200.0, 'window': 0.2}),
+            (
+                'feedforward',
+                {'silence': 0.2, 'ramp_slew': 200.0, 'window': 0.2, 'follow': 'gain'},
+            ),
         )
         g.output, g.asked = folder, []
         # recorded here, for every test of this file may be run alone
@@ -146,9 +149,15 @@ def test_live_replayed_and_offline_models_are_equal(whole):
         whole.start('identifier', QUICK, 'replay', wait=False),
     ]
     try:
-        for asked in 'player/start', 'identifier/identify':
-            end = whole.finish(f'replay/{asked}')
-            assert end['state'] == 'done', (asked, end)
+        end = whole.finish('replay/player/start')
+        assert end['state'] == 'done', end
+        # the player is done when the last message has left, not when it has arrived
+        captured = re.compile(r'(\d\S*) s of voltage, \1 s of displacement captured')
+        whole.wait(
+            lambda: captured.match(whole.status('replay/identifier')['text']), 'the last message'
+        )
+        end = whole.finish('replay/identifier/identify')
+        assert end['state'] == 'done', end
         whole.wait(lambda: replayed, 'the replayed model')
         models.append(replayed[-1])
     finally:
@@ -354,6 +363,18 @@ def test_what_is_no_parameter_is_refused(whole):
         assert not taken and reason == 'nonsense is no parameter of this node'
     reason = 'rate_facter is no parameter of this node; did you mean rate_factor?'
     assert whole.set('excitation', 'rate_facter', 1.0) == (False, reason)
+
+
+def test_a_bare_off_is_the_choice_off():
+    # YAML reads it as false
+    with Graph() as g:
+        g.start_all(('model', {'adapt': False}))
+        assert g.get('model', 'adapt') == 'off'
+        assert g.set('model', 'adapt', 'gain') == (True, '')
+        assert g.set('model', 'adapt', False) == (True, '')
+        assert g.get('model', 'adapt') == 'off'
+        taken, reason = g.set('model', 'adapt', True)
+        assert not taken and 'hysteresis' in reason
 
 
 def test_every_yaml_file_loads_into_its_running_node():
