@@ -292,7 +292,8 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
                 title=title,
             )
             write_text(args.out, header)
-            known = (f'{name}_step', f'{name}_feedforward_step')
+            axes = [f'_{axis.lower()}' for axis in getattr(model, 'axes', ())]
+            known = [f'{name}_step', *(f'{name}{x}_feedforward_step' for x in ('', *axes))]
             functions = [function for function in known if f'{function}(' in header]
         elif isinstance(model, MultiAxisModel):
             raise ConfigError(

@@ -184,6 +184,7 @@ class Adaptation:
         self._theta = np.zeros(len(self._changes) + 1)
         self._information, self._now = self._prior.copy(), np.zeros(kernel.PLACES)
         self._now[kernel.SCALE] = 1.0
+        self._sums = np.zeros(len(self._changes) + 1)
 
     def begin(self, recalled: Recalled = StageModel.stream) -> None:
         """Begin another run with the learnt changes."""

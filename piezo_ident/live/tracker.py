@@ -276,12 +276,18 @@ def held(x: Array, before: float) -> Array:
     """
     Replace each NaN or infinite sample by the sample before it.
 
+    Without a sample before, which is NaN then, the first finite sample of the block replaces it.
+
     >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
     [3.0, 1.0, 1.0]
+    >>> held(np.array([np.nan, 1.0, np.inf]), np.nan).tolist()
+    [1.0, 1.0, 1.0]
     """
     good = np.isfinite(x)
     if good.all():
         return x
+    if good.any() and not math.isfinite(before):
+        before = float(x[np.argmax(good)])
     last = np.where(good, np.arange(1, x.size + 1), 0)
     return np.append(before, x)[np.maximum.accumulate(last)]
 
@@ -324,7 +330,9 @@ class _Join:
     """
 
     def __init__(self, start: float, step: float, moves: bool = False) -> None:
-        self.last = self._start = self._command = start
+        self.last = self._start = start
+        # no sample of the reference is known yet
+        self._command = math.nan
         self._step, self._moves = step, moves
         self._length, self._done = -1, 0
         self._distance = 0.0
@@ -333,6 +341,8 @@ class _Join:
         """Join the next samples; a sample that is NaN or infinite repeats the last sample."""
         x = held(x, self._command)
         self._command = float(x[-1])
+        if not math.isfinite(self._command):
+            return np.full(x.size, self.last)
         if self._length < 0:
             before = 2.0 * x[0] - x[1] if self._moves and x.size > 1 else x[0]
             self._distance = self._start - float(before)

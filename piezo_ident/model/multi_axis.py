@@ -71,18 +71,19 @@ def axes_of(records: Sequence[Record]) -> tuple[str, ...]:
     DataError
         When the records do not hold the same axes.
     """
-    of_each = {
-        record.name: (
+    of_each = [
+        (
+            record.name,
             'y',
             *sorted(k for k in p.channels if role_of(k) == 'y' and voltage_of(k) in p.channels),
         )
         for record in records
         for p in record
-    }
-    if len(set(of_each.values())) > 1:
-        told = '; '.join(f'{name} holds {", ".join(axes)}' for name, axes in of_each.items())
+    ]
+    if len({axes[1:] for axes in of_each}) > 1:
+        told = '; '.join(f'{name} holds {", ".join(axes)}' for name, *axes in of_each)
         raise DataError(f'{told}; give records of the same axes')
-    return next(iter(of_each.values()), ('y',))
+    return next(iter(of_each), ('', 'y'))[1:]
 
 
 def axis_record(
@@ -306,8 +307,11 @@ class MultiAxisModel:
         DataError
             When the voltage of an axis is missing.
         """
-        self.check_axes([f'y{name[1:]}' for name in voltages], 'simulate')
+        given = [name for name in voltages if name == 'v' or role_of(name) == 'v']
+        self.check_axes([f'y{name[1:]}' for name in given], 'simulate')
         v, further = {a: voltages[voltage_of(a)] for a in self.axes}, dict(channels or {})
+        if len({np.size(x) for x in v.values()}) > 1:
+            raise DataError('simulate: the voltages of the axes differ in length')
         own = {a: self.own(a).simulate(v[a], channels=further) for a in self.axes}
         moved = {motion_of(a): m for a, m in own.items()}
         return {

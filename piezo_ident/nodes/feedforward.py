@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+import math
 import time
 from typing import Any
 
@@ -194,7 +195,7 @@ class FeedforwardNode(DrivingNode):
         self._heard = 0
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._take_right(self._tracker)
-        self._last_value = self._tracker.inverse.position
+        self._last_value = math.nan
         return self._tracker
 
     def _clear(self) -> None:
@@ -231,7 +232,9 @@ class FeedforwardNode(DrivingNode):
         if not verdict.is_taken:
             self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
-        x = held(samples.values, self._last_value)
+        # the first sample of a stream has none before it
+        is_new = verdict.kind is Kind.START
+        x = held(samples.values, math.nan if is_new else self._last_value)
         if bad := samples.not_finite:
             about = 'samples of the reference are no numbers: the last one stays in force'
             self._faults.note('not_finite', f'{bad} {about}', bad)
@@ -242,15 +245,15 @@ class FeedforwardNode(DrivingNode):
         if not self._labels or self._labels[-1][1] != samples.segment:
             self._labels.append((self._heard, samples.segment))
         self._heard += x.size
-        if verdict.kind is Kind.START:
+        if is_new:
             self._kept, self._length = [], 0
             self._answered = self._last
         self._last_value, self._length = float(x[-1]), self._length + x.size
-        if self._length <= self.values['longest'] * self._rate_of_clock:
+        is_short = self._length <= self.values['longest'] * self._rate_of_clock
+        if is_short and math.isfinite(self._last_value):
             self._kept.append(x.copy())
         tracker = self._tracker
         if tracker is not None:
-            is_new = verdict.kind is Kind.START
             self._counts['streams'] += is_new
             self._play(tracker.process(x, is_new and self._state == 'tracking'))
             self._state = 'tracking'

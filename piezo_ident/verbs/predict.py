@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import overload
 
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import expect
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.free_run import predict as predict_axis
@@ -70,6 +71,7 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     """
     if not isinstance(model, MultiAxisModel):
         return run_axis(model, record)
+    expect(record, Record, 'free_run, second argument', 'read a file with read')
     seen = model.seen(record)
     return EachAxis({axis: run_axis(x, seen[axis]) for axis, x in model.axes.items()})
 

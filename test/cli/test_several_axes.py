@@ -68,7 +68,8 @@ def test_invert_reads_a_motion_of_each_axis(capsys, folder, tmp_path):
 
 
 def test_export_writes_a_step_of_all_axes(capsys, folder, tmp_path):
-    succeed(capsys, 'export', folder / 'stage.yaml', '--out', tmp_path / 'stage.h')
+    told = succeed(capsys, 'export', folder / 'stage.yaml', '--out', tmp_path / 'stage.h')
+    assert 'stage_y_feedforward_step' in told and 'no feed-forward' not in told
     assert 'stage_step(stage_state *s, const double v[2]' in (tmp_path / 'stage.h').read_text()
     words = ['export', folder / 'stage.yaml', '--out', tmp_path / 'stage.fmu']
     refuse(capsys, tmp_path, words, 'stage.yaml', 'several axes')

@@ -50,6 +50,16 @@ def test_a_reference_is_joined_from_rest_and_followed_a_preview_later():
         tracker.idle(100)
 
 
+@pytest.mark.parametrize('first', [1, 100, 250])
+def test_a_reference_that_begins_with_nan_is_joined_at_its_first_number(first):
+    reference = sine()
+    reference[:first] = np.nan
+    _, v, wanted = tracked(Tracker(PAPER, SETTINGS), reference)
+    assert np.isfinite(wanted).all()
+    # 0.02 V a sample is the steepest of the same reference without a gap
+    assert np.abs(np.diff(v[:4000])).max() < 2e-2
+
+
 def test_how_it_is_cut_changes_nothing():
     reference = sine(0.1)
     one = tracked(Tracker(CREEP, SETTINGS), reference, 2000)

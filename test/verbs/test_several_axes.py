@@ -163,6 +163,22 @@ def test_axes_that_do_not_belong_together_are_refused():
         pi.free_run(scanner(), pi.Record.from_arrays(*np.zeros((2, 100)), sample_rate=1000.0))
 
 
+def test_records_of_other_axes_are_refused_though_they_have_one_name():
+    v = np.arange(10.0)
+    y = 1e-6 * v
+    one = pi.Record.from_arrays(v, y, sample_rate=10.0)
+    two = pi.Record.from_arrays(v, y, sample_rate=10.0, channels={'v_b': v, 'y_b': y})
+    for records in ([one, two], [two, one]):
+        with pytest.raises(pi.DataError, match='y_b'):
+            pi.identify(records)
+
+
+def test_voltages_that_differ_in_length_are_refused():
+    model = MultiAxisModel(dict.fromkeys(('y', 'y_b'), chain([0.1, 0.1, 0.1], 0.5, 1e-6)))
+    with pytest.raises(pi.DataError, match='length'):
+        model.simulate({'v': np.zeros(20), 'v_b': np.zeros(10)})
+
+
 def test_an_axis_sees_no_label_under_which_it_rests():
     moves, rests = np.linspace(0, 10, 100), np.zeros(100)
     v, v_b = np.concatenate([moves, rests]), np.concatenate([rests, moves])
