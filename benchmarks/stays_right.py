@@ -54,9 +54,10 @@ TEXT = """\
 This page tells whoever runs a stage for hours what the live model makes of a stage that changes.
 `make stays-right` made it.
 
-Each simulated stage follows laws that the model does not have. It was identified from one record
-and diagnosed on another. Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle
-whose corners are round. One thing about it changed {at:g} s later:
+Each of {stages} simulated stages follows laws that the model does not have. Nobody had looked at
+these stages while the live model was built. A stage was identified from one record and diagnosed
+on another. Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle whose corners
+are round. One thing about it changed {at:g} s later:
 
 - **creep amid motion**: it was at the highest voltage for ten seconds, until half a second before
   the scan;
@@ -246,7 +247,7 @@ def _medians(rows: Sequence[Row], numbers: Callable[[Row], Sequence[float]]) -> 
     lines = []
     for change in CHANGES:
         own = np.median([numbers(row) for row in rows if row.change == change], axis=0)
-        lines.append([change, *(f'{x:.0f}' if x >= 100.0 else f'{x:.2g}' for x in own)])
+        lines.append([change, *(f'{x:.0f}' if x >= 99.5 else f'{x:.2g}' for x in own)])
     return lines
 
 
@@ -284,6 +285,7 @@ def page(rows: Sequence[Row]) -> str:
     both = [f'{head}: {s:g} s' for head in (HEADS[0], *HEADS[1:3], HEADS[4]) for s in HORIZONS]
     kept = (0, 1, 2, 4)
     return TEXT.format(
+        stages=len({row.stage for row in rows}),
         low=LOW,
         high=HIGH,
         lines=LINES,
