@@ -119,7 +119,8 @@ def test_slower_and_faster_than_real_time(lab, factor):
         # every run starts the sample clock
         t, _ = column(back[seen:])
         assert t.tobytes() == (np.arange(sequence.n) / FS).tobytes()
-        assert arrivals[-1] - arrivals[sent] > 0.8 * sequence.duration / factor
+        # a late first block is no higher rate
+        assert arrivals[-1] - arrivals[sent] > 0.5 * sequence.duration / factor
     finally:
         assert lab.set('excitation', 'rate_factor', 1.0)[0]
         assert lab.set('excitation', 'block_size', 100)[0]
