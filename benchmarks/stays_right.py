@@ -26,7 +26,7 @@ from piezo_ident.fitting.adaptation import Adaptation
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.report.figures import style
 from study_diagnosis import measured
-from study_rows import section
+from study_rows import dots_and_ranges, section
 from truths import make_stage
 from truths.linear import Cascade, RATE
 from truths.stage import SPAN, Stage
@@ -253,23 +253,10 @@ def _medians(rows: Sequence[Row], numbers: Callable[[Row], Sequence[float]]) -> 
 
 def picture(rows: Sequence[Row]) -> Figure:
     """Draw the errors after each change: the median of the stages, and the range."""
-    fig = style.figure(0.8 + 0.6 * len(CHANGES))
-    axes = fig.subplots()
-    colours = style.GREY, style.VERMILION, style.BLUE, style.GREEN, style.BLACK
-    for j, (head, colour) in enumerate(zip(HEADS, colours, strict=True)):
-        for i, change in enumerate(CHANGES):
-            errors = [row.after[j] for row in rows if row.change == change]
-            y = i + 0.14 * (j - 2.0)
-            axes.plot([min(errors), max(errors)], [y, y], color=colour, linewidth=2.0, alpha=0.5)
-            label = None if i else head
-            axes.plot(np.median(errors), y, 'o', color=colour, markersize=5, label=label)
-    axes.set_xscale('log')
-    axes.set_yticks(range(len(CHANGES)), CHANGES)
-    axes.invert_yaxis()
-    style.tidy(axes, 'error rms / % of the span, from 5 s after the change on')
-    style.plain_log(axes.xaxis, *axes.get_xlim())
-    style.legend_above(axes)
-    return fig
+    errors = {change: [row.after for row in rows if row.change == change] for change in CHANGES}
+    return dots_and_ranges(
+        errors, HEADS, 'error rms / % of the span, from 5 s after the change on'
+    )
 
 
 def page(rows: Sequence[Row]) -> str:

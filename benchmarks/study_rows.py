@@ -1,11 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The rows of the studies of the diagnosis: kept in a file, as tables, and as CSV."""
+"""The rows of the studies: kept in a file, as tables, as CSV, and as a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import csv
 from dataclasses import asdict, fields
 import json
@@ -13,6 +13,9 @@ import multiprocessing
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+import numpy as np
+from piezo_ident.report.figures import style
 from side_by_side import markdown
 from tqdm import tqdm
 
@@ -83,3 +86,37 @@ def all_rows(
             kept.write(json.dumps(asdict(row)) + '\n')
             kept.flush()
     return rows
+
+
+def dots_and_ranges(
+    errors: Mapping[str, Sequence[Sequence[float]]], heads: Sequence[str], label: str
+) -> Figure:
+    """
+    Draw errors on a logarithmic axis, a line for each key: medians as dots, ranges as bars.
+
+    Parameters
+    ----------
+    errors : mapping of str to sequence of sequence of float
+        For each line its cases, each with an error for every head.
+    heads : sequence of str
+    label : str
+        Name and unit of the errors.
+    """
+    fig = style.figure(0.8 + (0.2 + 0.08 * len(heads)) * len(errors))
+    axes = fig.subplots()
+    colours = style.GREY, style.VERMILION, style.BLUE, style.GREEN, style.BLACK
+    for j, (head, colour) in enumerate(zip(heads, colours, strict=False)):
+        for i, cases in enumerate(errors.values()):
+            own = [case[j] for case in cases]
+            y = i + 0.14 * (j - 0.5 * (len(heads) - 1))
+            axes.plot([min(own), max(own)], [y, y], color=colour, linewidth=2.0, alpha=0.5)
+            axes.plot(
+                np.median(own), y, 'o', color=colour, markersize=5, label=None if i else head
+            )
+    axes.set_xscale('log')
+    axes.set_yticks(range(len(errors)), list(errors))
+    axes.invert_yaxis()
+    style.tidy(axes, label)
+    style.plain_log(axes.xaxis, *axes.get_xlim())
+    style.legend_above(axes)
+    return fig

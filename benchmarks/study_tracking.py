@@ -28,7 +28,7 @@ from piezo_ident.report import length
 from piezo_ident.report.figures import style
 from study_diagnosis import measured
 from study_foreign import case_records
-from study_rows import section, write_cases
+from study_rows import dots_and_ranges, section, write_cases
 from tqdm import tqdm
 from truths import make_stage
 from truths.linear import RATE
@@ -224,24 +224,10 @@ def medians(rows: Sequence[Row]) -> str:
 
 def picture(rows: list[Row]) -> Figure:
     """Draw the errors of each stage: the median of its motions, and the range."""
-    stages = list(dict.fromkeys(row.stage for row in rows))
-    fig = style.figure(0.8 + 0.52 * len(stages))
-    axes = fig.subplots()
-    colours = style.GREY, style.VERMILION, style.BLUE, style.GREEN
-    for j, (head, colour) in enumerate(zip(HEADS, colours, strict=True)):
-        for i, stage in enumerate(stages):
-            errors = [row.errors[j] for row in rows if row.stage == stage]
-            y = i + 0.16 * (j - 1.5)
-            axes.plot([min(errors), max(errors)], [y, y], color=colour, linewidth=2.0, alpha=0.5)
-            label = None if i else head
-            axes.plot(np.median(errors), y, 'o', color=colour, markersize=5, label=label)
-    axes.set_xscale('log')
-    axes.set_yticks(range(len(stages)), stages)
-    axes.invert_yaxis()
-    style.tidy(axes, 'tracking error rms / % of the stroke of the motion')
-    style.plain_log(axes.xaxis, *axes.get_xlim())
-    style.legend_above(axes)
-    return fig
+    errors: dict[str, list[Sequence[float]]] = {}
+    for row in rows:
+        errors.setdefault(row.stage, []).append(row.errors)
+    return dots_and_ranges(errors, HEADS, 'tracking error rms / % of the stroke of the motion')
 
 
 def main() -> None:

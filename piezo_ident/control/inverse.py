@@ -160,17 +160,6 @@ def invert(
         When the wanted motion is no vector of finite numbers, or the limits do not reach it.
     ModelError
         When the model has no inverse.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import piezo_ident as pi
-    >>> model = pi.SimulatedStage.load('paper').model
-    >>> t = np.arange(4000) / model.sample_rate
-    >>> wanted = 30e-6 * (1 - np.cos(2 * np.pi * 10 * t)) + 5e-6
-    >>> drive = pi.invert(model, wanted)
-    >>> drive.error < 0.01, bool(0 <= drive.v.min() and drive.v.max() <= 10)
-    (True, True)
     """
     y = checked_motion(wanted)
     if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):

@@ -164,18 +164,23 @@ class Corrector:
         self._forget()
 
     @property
-    def learnt(self) -> StageModel:
-        """The learnt model; DataError if the corrector does not learn."""
+    def _learning(self) -> Adaptation:
+        """The adaptation; DataError if the corrector does not learn."""
         if self._adaptation is None:
             raise DataError('nothing is learnt: there is no model, or the parameter adapt is off')
-        return self._adaptation.learnt_model
+        return self._adaptation
+
+    @property
+    def learnt(self) -> StageModel:
+        """The learnt model; DataError if the corrector does not learn."""
+        return self._learning.learnt_model
 
     def restore(self) -> str:
         """Return to the given model; the message says how much motion is forgotten."""
-        said = self.learnt.identification['adaptation'][-1]['seconds']
-        if self._adaptation is not None:
-            self._adaptation.restore()
-        return f'the model is as it was given; forgotten: what {said:g} s of motion told'
+        adaptation = self._learning
+        seconds = round(adaptation.seconds, 3)
+        adaptation.restore()
+        return f'the model is as it was given; forgotten: what {seconds:g} s of motion told'
 
     def ahead(self, lead: int, n: int) -> tuple[Array, float]:
         """

@@ -18,7 +18,7 @@ channel is the motion.  An axis has the name of its displacement in a record:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import os
 from types import MappingProxyType
@@ -257,9 +257,9 @@ class MultiAxisModel:
         """Refuse a piece with another sampling rate than the model with a ModelError."""
         next(iter(self.axes.values())).check_rate(piece)
 
-    def check_axes(self, axes: Sequence[str], name: str) -> None:
-        """Refuse data of other axes with a DataError."""
-        missing = [axis for axis in self.axes if axis not in axes]
+    def check_axes(self, columns: Collection[str], name: str) -> None:
+        """Refuse data without the voltage of an axis with a DataError."""
+        missing = [axis for axis in self.axes if voltage_of(axis) not in columns]
         if missing:
             raise DataError(
                 f'{name}: has nothing of {", ".join(missing)}; the model holds for '
@@ -277,10 +277,7 @@ class MultiAxisModel:
 
     def seen(self, record: Record) -> dict[str, Record]:
         """Split a record by axis, with the motions of the other axes as channels."""
-        columns = {c for piece in record for c in _columns(piece)}
-        self.check_axes(
-            [f'y{c[1:]}' for c in columns if c == 'v' or role_of(c) == 'v'], record.name
-        )
+        self.check_axes({c for piece in record for c in _columns(piece)}, record.name)
         motions = self.motions(record)
         return {axis: axis_record(record, axis, motions) for axis in self.axes}
 
@@ -307,8 +304,7 @@ class MultiAxisModel:
         DataError
             When the voltage of an axis is missing.
         """
-        given = [name for name in voltages if name == 'v' or role_of(name) == 'v']
-        self.check_axes([f'y{name[1:]}' for name in given], 'simulate')
+        self.check_axes(voltages, 'simulate')
         v, further = {a: voltages[voltage_of(a)] for a in self.axes}, dict(channels or {})
         if len({np.size(x) for x in v.values()}) > 1:
             raise DataError('simulate: the voltages of the axes differ in length')

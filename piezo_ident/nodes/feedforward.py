@@ -232,8 +232,8 @@ class FeedforwardNode(DrivingNode):
         if not verdict.is_taken:
             self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
-        # the first sample of a stream has none before it
         is_new = verdict.kind is Kind.START
+        # nothing comes before the first sample of a stream
         x = held(samples.values, math.nan if is_new else self._last_value)
         if bad := samples.not_finite:
             about = 'samples of the reference are no numbers: the last one stays in force'
@@ -252,8 +252,7 @@ class FeedforwardNode(DrivingNode):
         is_short = self._length <= self.values['longest'] * self._rate_of_clock
         if is_short and math.isfinite(self._last_value):
             self._kept.append(x.copy())
-        tracker = self._tracker
-        if tracker is not None:
+        if (tracker := self._tracker) is not None:
             self._counts['streams'] += is_new
             self._play(tracker.process(x, is_new and self._state == 'tracking'))
             self._state = 'tracking'

@@ -90,16 +90,18 @@ def identify(
     True
     """
     records, validation = (records_of(x, 'identify') for x in (records, validation))
-    of_axes = {
-        axis: [part for record in records for part in _moved(record, axis)]
-        for axis in axes_of([*records, *validation])
-    }
+    axes = axes_of([*records, *validation])
+    if len(axes) == 1:
+        return identify_axis(
+            records, settings, validation=validation, progress=progress, steps=steps
+        )
+    of_axes = {axis: [part for r in records for part in _moved(r, axis)] for axis in axes}
     still = tuple(
         f'{voltage_of(axis)} never moves; axis {axis} is not identified'
         for axis, parts in of_axes.items()
         if not parts
     )
-    if len(of_axes) == 1 or not any(of_axes[axis] for axis in of_axes if axis != 'y'):
+    if not any(of_axes[axis] for axis in axes if axis != 'y'):
         one = identify_axis(
             records, settings, validation=validation, progress=progress, steps=steps
         )
