@@ -91,7 +91,7 @@ mirror: .venv/.demo
 # cores; goes on where it was stopped
 study: .venv/.demo
 	.venv/bin/python benchmarks/study_diagnosis.py docs/diagnosis_study.md
-	.venv/bin/python benchmarks/study_foreign.py docs/diagnosis_study_foreign.md
+	.venv/bin/python benchmarks/study_diagnosis.py --set next docs/diagnosis_study_foreign.md
 
 # what docs/reliability.md says, run again; then the page is made of what came out
 RUN_STUDY = .venv/bin/python benchmarks/reliability

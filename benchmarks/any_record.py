@@ -24,7 +24,6 @@ import time
 import warnings
 
 import bouc_wen
-from foreign.stage import make_core, make_linear, Stage
 import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
@@ -33,6 +32,9 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from scipy.optimize import least_squares, nnls
 from scipy.signal import butter, chirp, lfilter, sosfiltfilt
 from study_rows import write_cases
+from truths import FamilyStage
+from truths.families import make_core
+from truths.linear import make_linear
 
 Array = NDArray[np.float64]
 
@@ -123,7 +125,7 @@ KINDS = (
 class Case:
     """A stage, a kind of motion, and voltage [V] and displacement [m] to fit and to judge."""
 
-    stage: Stage
+    stage: FamilyStage
     kind: str
     fit: list[tuple[Array, Array]]
     judge: list[tuple[Array, Array]]
@@ -134,7 +136,7 @@ def draw(law: str, kind: str, seed: int, seconds: float = SECONDS) -> Case:
     rng = np.random.default_rng([4711, seed, *law.encode()])
     core, linear = make_core(law, rng), make_linear(rng, RATE, 600.0)
     noise = float(np.exp(rng.uniform(np.log(5e-5), np.log(5e-4))))
-    stage = Stage(core, linear, RATE, (0.0, 100.0), 50e-6, 1e-6, 'white', noise, seed=seed)
+    stage = FamilyStage(core, linear, RATE, (0.0, 100.0), 50e-6, 1e-6, 'white', noise, seed=seed)
     own = np.random.default_rng([4712, seed, *law.encode(), *kind.encode()])
 
     def records(name: str) -> list[tuple[Array, Array]]:

@@ -25,7 +25,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.fitting.adaptation import Adaptation
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.report.figures import style
-from study_diagnosis import measured
+from study_records import measured
 from study_rows import dots_and_ranges, section
 from truths import make_stage
 from truths.linear import Cascade, RATE

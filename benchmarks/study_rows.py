@@ -61,10 +61,13 @@ def write_cases(page: Path, heads: str, rows: Iterable[Sequence[object]]) -> str
 def read_rows(path: Path, kind: type) -> dict[str, Any]:
     """Return the rows that are kept in a file, by key; a kind may have lost fields since."""
     known = {f.name for f in fields(kind)}
+    # the names of the effects in files of old
+    renamed = {'found': 'effects'} if 'found' not in known else {}
     rows = {}
     if path.exists():
         for text in path.read_text(encoding='utf-8').splitlines():
-            data = {k: x for k, x in json.loads(text).items() if k in known}
+            data = {renamed.get(k, k): x for k, x in json.loads(text).items()}
+            data = {k: x for k, x in data.items() if k in known}
             data = {k: tuple(x) if isinstance(x, list) else x for k, x in data.items()}
             rows[data['key']] = kind(**data)
     return rows

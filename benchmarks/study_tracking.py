@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from foreign import draw
 from matplotlib.figure import Figure
 import numpy as np
 import piezo_ident as pi
@@ -26,17 +25,16 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.report import length
 from piezo_ident.report.figures import style
-from study_diagnosis import measured
-from study_foreign import case_records
+from study_records import case_records, measured
 from study_rows import dots_and_ranges, section, write_cases
 from tqdm import tqdm
-from truths import make_stage
+from truths import draw, make_stage
 from truths.linear import RATE
 
 #: plays a voltage [V] and returns the displacement [m]
 Play = Callable[[Array], Array]
 
-#: stages: an effect of `truths`, its size and seed; or the number of a foreign one
+#: stages: an effect of `truths`, its size and seed; or the number of one of another family
 STAGES: tuple[tuple[str, float, int] | int, ...] = (
     ('creep', 1.0, 0),
     ('rate_dependent_hysteresis', 1.0, 1),

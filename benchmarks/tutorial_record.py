@@ -8,7 +8,7 @@ The records of the tutorial: a stage that nothing in the package is a model of.
 
 The hysteresis is a Preisach operator with an uneven density, the creep follows a power of time
 over 60 relaxations, the mode and the sensor are continuous, the delay is no whole number of
-samples, and the noise is 1/f and quantised (`foreign.stage`).  Written as a DAQ program would:
+samples, and the noise is 1/f and quantised (`truths`).  Written as a DAQ program would:
 time in s, voltage in V, position in um, no labels.
 """
 
@@ -18,16 +18,18 @@ import argparse
 from pathlib import Path
 import zipfile
 
-from foreign.stage import Linear, make_core, Stage
 import numpy as np
 from piezo_ident.excitation.program import parse_program
+from truths import FamilyStage
+from truths.families import make_core
+from truths.linear import Linear
 
 RATE = 2000.0
 LIMITS = (0.0, 100.0)
 STROKE = 80e-6
 
 HEAD = 'limits: [0, 100]\nsample_rate: 2000\nslew: 200\nsegments:\n'
-#: file, name of the record in `foreign.stage`, and the signals that the generator played
+#: file, name of the record in `truths`, and the signals that the generator played
 PROGRAMS = {
     'calibration': (
         'identification',
@@ -63,10 +65,10 @@ PROGRAMS = {
 }
 
 
-def stage(record: str) -> Stage:
+def stage(record: str) -> FamilyStage:
     """Return the stage; behind the calibration its amplifier is one of less current."""
     slew = {} if record == 'identification' else {'slew_limit': 20.0}
-    return Stage(
+    return FamilyStage(
         core=make_core('preisach', np.random.default_rng(21)),
         linear=Linear(((210.0, 0.05, 0.9), (460.0, 0.03, 0.1)), 700.0, 1.3 / RATE),
         rate=RATE,

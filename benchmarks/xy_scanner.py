@@ -19,7 +19,6 @@ import functools
 from pathlib import Path
 import time
 
-from foreign.cores import bouc_wen_of, Core, core_of, uneven
 from matplotlib.figure import Figure
 import numpy as np
 import piezo_ident as pi
@@ -28,8 +27,11 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.report.figures import style
+from truths.differential import bouc_wen_of
+from truths.families import Core, core_of
 from truths.linear import Cascade, delayed, relaxation
 from truths.linear import RATE as FINE
+from truths.preisach import uneven
 
 #: sampling [Hz], stroke [m] and voltages [V] of either axis
 RATE, STROKE, LIMITS = 10_000.0, 50e-6, (0.0, 10.0)

@@ -3,39 +3,36 @@
 
 """The stages of another family and the rules by which a diagnosis of them is counted."""
 
-import ast
 import csv
 from dataclasses import replace
 from itertools import pairwise
+import json
 from pathlib import Path
 
-from foreign import case, cores, families, make_stage, record_motion, references, sealed_cores
-from foreign.sizes import size_of
-from foreign.stage import Linear, make_core
 import numpy as np
 import pytest
-import study_foreign as study
-from study_rows import write_cases
+import study_diagnosis as study
+from study_rows import read_rows, write_cases
+from truths import (
+    cases,
+    cores,
+    families,
+    make_family_stage,
+    preisach,
+    record_motion,
+    references,
+    sealed,
+)
+from truths.linear import Linear
+from truths.sizes import size_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'benchmarks'
 
 
-def test_stages_know_nothing_of_what_is_judged():
-    for path in (FOLDER / 'foreign').glob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
-                names = [node.module or '']
-            else:
-                continue
-            assert not [n for n in names if n.startswith('piezo_ident')], path.name
-
-
 def test_preisach_operator_is_the_sum_of_its_relays(monkeypatch):
     cells = 30
-    monkeypatch.setattr(cores, 'CELLS', cells)
+    monkeypatch.setattr(preisach, 'CELLS', cells)
 
     def density(a, b):
         return np.exp(-3 * (a - b)) * (1.0 + 0.8 * (a + b - 1.0))
@@ -43,7 +40,7 @@ def test_preisach_operator_is_the_sum_of_its_relays(monkeypatch):
     rng = np.random.default_rng(4)
     levels = np.concatenate([[0.0], rng.uniform(0.0, 1.0, 60), [1.0, 0.5]])
     u = np.concatenate([np.linspace(x, y, 4) for x, y in pairwise(levels)])
-    found = cores.preisach(density)(u)
+    found = preisach.preisach(density)(u)
     # much finer relays, each with the density of its cell; half of those on the diagonal
     fine = 20 * cells
     a, b = np.meshgrid(np.arange(fine), np.arange(fine), indexing='ij')
@@ -61,20 +58,20 @@ def test_preisach_operator_is_the_sum_of_its_relays(monkeypatch):
 
 @pytest.mark.parametrize('group', ['tuning', 'known', 'final'])
 def test_cores_are_those_of_piezos(group):
-    for name in dict.fromkeys(families.SETS[group]):
-        core = make_core(name, np.random.default_rng(5))
-        _, rise, fall = cores.steady_loop(core)
+    for name in dict.fromkeys(cases.SETS[group][2]):
+        core = families.make_core(name, np.random.default_rng(5))
+        _, rise, fall = families.steady_loop(core)
         assert [rise[0], rise[-1]] == pytest.approx([0.0, 1.0], abs=1e-6)
         assert np.diff(rise).min() > 0
         assert np.diff(fall).min() > 0
         # the stage lags
         assert 0.0799 < (fall - rise).max() < 0.1801
-        assert 0.0005 < cores.unlike_plays(core) < 0.01
+        assert 0.0005 < families.unlike_plays(core) < 0.01
 
 
 def test_laws_of_the_final_set_are_in_no_other():
-    others = {name for group, names in families.SETS.items() if group != 'final' for name in names}
-    assert not set(families.SETS['final']) & others
+    others = {name for group in ('tuning', 'known') for name in cases.SETS[group][2]}
+    assert not set(families.SEALED) & others
 
 
 def tour(levels, count=400, bend=1.0):
@@ -90,7 +87,7 @@ ROUND = [0.0, 1.0, 0.0, 0.6, 0.3, 0.6, 1.0, 0.0]
 
 def test_laws_of_the_final_set_know_no_time():
     levels = [*ROUND, *np.random.default_rng(2).uniform(0.0, 1.0, 20)]
-    for name in families.SETS['final']:
+    for name in families.SEALED:
         law = families.LAWS[name](np.random.default_rng(5))
         (slow, at), (fast, then) = tour(levels, 1200), tour(levels, 150, 1.7)
         z = law(slow)[at]
@@ -101,11 +98,11 @@ def test_a_moment_follows_its_field_on_a_tractrix():
     one, r, bow, middle = np.ones(1), 0.15, 1.5, 0.4
     u, at = tour(ROUND)
     # a straight way: a play
-    z = sealed_cores.dragged_moments_of(middle, r * one, 0.0 * one, one, 1e9)(u)
-    expected = cores.play(u, 2.0 * r) + r - middle
+    z = sealed.dragged_moments_of(middle, r * one, 0.0 * one, one, 1e9)(u)
+    expected = families.play(u, 2.0 * r) + r - middle
     assert z[at[1] :] == pytest.approx(expected[at[1] :], abs=1e-9)
     # a bent one: drawn back onto the circle after every small step
-    z = sealed_cores.dragged_moments_of(middle, r * one, bow * one, one, 1e9)(u)
+    z = sealed.dragged_moments_of(middle, r * one, bow * one, one, 1e9)(u)
     fine = tour(ROUND, 8000)[0]
     x = fine[0] - middle
     moment, expected = np.array([x, bow * x * x]), []
@@ -118,12 +115,12 @@ def test_a_moment_follows_its_field_on_a_tractrix():
     assert z == pytest.approx(np.array(expected)[::20], abs=2e-4)
     # what was across is not found again
     u, at = tour([0.0, 1.0, 0.4, 1.0, 0.4, 1.0])
-    z = sealed_cores.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(u)
+    z = sealed.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(u)
     assert z[at[5]] - z[at[3]] > 1e-3
     # a step that is lost to rounding is none
     tiny = np.repeat(u, 2)
     tiny[1::2] += 1e-18
-    assert sealed_cores.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(tiny)[::2] == (
+    assert sealed.dragged_moments_of(middle, 0.3 * one, bow * one, one, 1e9)(tiny)[::2] == (
         pytest.approx(z, abs=1e-12)
     )
 
@@ -148,7 +145,7 @@ def rested(u, bias, friction, bonds):
 
 
 def test_a_spin_goes_back_where_its_neighbours_come():
-    count = sealed_cores.NEAR
+    count = sealed.NEAR
     bias, bond = np.full(count, -100.0), np.zeros((count, 1))
     # one between two that are drawn away from it by 0.1, and it from each of them
     bias[:3], bond[:2, 0] = (-0.34, -0.39, -0.36), -0.1
@@ -156,12 +153,12 @@ def test_a_spin_goes_back_where_its_neighbours_come():
     # they go at 0.25 and 0.23, where it comes again until 0.18
     u = [0.0, 0.19, 0.21, 0.44, 0.46, 0.48, 0.59, 0.61, 0.59, 0.57, 0.26, 0.24, 0.22, 0.17]
     up = [0, 0, 1, 1, 2, 2, 2, 3, 3, 2, 2, 1, 1, 0]
-    law = sealed_cores.random_bonds_of(bias, np.full(count, 0.01), bond)
+    law = sealed.random_bonds_of(bias, np.full(count, 0.01), bond)
     assert law(np.array(u)) * count == pytest.approx(np.array(up, float))
 
 
 def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way():
-    rng, count = np.random.default_rng(7), 12 * sealed_cores.NEAR
+    rng, count = np.random.default_rng(7), 12 * sealed.NEAR
     bias = -rng.uniform(-0.5, 1.5, count)
     friction = 0.1 * np.exp(0.5 * rng.standard_normal(count))
     bond = 0.2 * rng.standard_normal((count, 3))
@@ -173,7 +170,7 @@ def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way():
             for i in range(count):
                 j = (i + d + 1) % count
                 whole[i, j] = whole[j, i] = own[i, d]
-        z = sealed_cores.random_bonds_of(bias, friction, own)(u)
+        z = sealed.random_bonds_of(bias, friction, own)(u)
         assert z == pytest.approx(rested(u, bias, friction, whole), abs=1e-12), name
         moved[name] = abs(z[at[5]] - z[at[3]])
     assert moved['none'] == moved['one way'] == 0.0
@@ -183,7 +180,7 @@ def test_spins_remember_an_extreme_where_all_bonds_are_for_one_way():
 def test_a_slider_slips_where_its_load_lets_it():
     one, stiff, limit, lean, bend = np.ones(1), 1.5, 0.12, 0.5, 0.2
     u, at = tour(ROUND)
-    law = sealed_cores.loaded_sliders_of(stiff * one, limit * one, lean, bend)
+    law = sealed.loaded_sliders_of(stiff * one, limit * one, lean, bend)
     x = law(u)
     most = limit * (1.0 + lean * (2.0 * x - 1.0))
     force = u - x - bend * (x * x - x)
@@ -201,7 +198,7 @@ def test_a_slider_slips_where_its_load_lets_it():
 
 def test_a_slope_is_shared_by_the_gap_ahead():
     middle, apart, broad, wider = 0.5, 0.2, 0.8, 1.05
-    law = cores.law_of(sealed_cores._gap_shares, middle, apart, broad, wider)
+    law = cores.law_of(sealed._gap_shares, middle, apart, broad, wider)
 
     def limiting(u):
         lower = (u - middle - 0.5 * apart) / broad
@@ -231,13 +228,13 @@ def test_a_slope_is_shared_by_the_gap_ahead():
 
 def stage_of(law):
     """Return a stage of a core without noise."""
-    stage = make_stage('preisach', 3)
+    stage = make_family_stage('preisach', 3)
     core = replace(stage.core, law=law, line=0.6, share=0.4, level=0.0)
     return replace(stage, core=core, rate=10_000.0, noise='white', noise_rms=0.0)
 
 
 def test_plays_reach_a_stage_of_plays():
-    stage = stage_of(lambda u: cores.play(u, 0.2) + 0.5 * cores.play(u, 0.6))
+    stage = stage_of(lambda u: families.play(u, 0.2) + 0.5 * families.play(u, 0.6))
     records = {}
     for name in ('identification', 'diagnosis', 'unseen'):
         moved = record_motion(
@@ -268,14 +265,14 @@ def test_offset_and_gain_are_no_effect():
 
 
 def test_blocks_of_cases_hold_every_kind():
-    for group in case.CASES:
-        cases = [case.draw(group, k) for k in range(case.CASES[group])]
-        assert len({c.key for c in cases}) == len(cases)
-        for k in range(0, len(cases), case.BLOCK):
-            kinds = [c.kind for c in cases[k : k + case.BLOCK]]
+    for group in cases.CASES:
+        drawn = [cases.draw(group, k) for k in range(cases.CASES[group])]
+        assert len({c.key for c in drawn}) == len(drawn)
+        for k in range(0, len(drawn), cases.BLOCK):
+            kinds = [c.kind for c in drawn[k : k + cases.BLOCK]]
             assert [kinds.count(x) for x in ('none', 'pair', 'fault')] == [6, 2, 2]
-        labelled = sum(c.labelled for c in cases)
-        assert labelled == 2 * len(cases) // 3
+        labelled = sum(c.labelled for c in drawn)
+        assert labelled == 2 * len(drawn) // 3
 
 
 @pytest.mark.parametrize(
@@ -321,7 +318,7 @@ def test_faults_of_the_data_are_named_by_the_record():
 
 def test_the_smallest_dynamics_of_those_that_do_as_well_are_chosen():
     # small loops open less than H says: orders of eleven fit that, for 1 % of the error
-    records = study.case_records(case.draw('known', 48), forms=False)
+    records = study.case_records(cases.draw('known', 48), forms=False)
     model = study.identify(records.identification).model
     assert model.dynamics.a.size <= 4
     ((_, error),) = study.unseen_errors(records.unseen, model)
@@ -345,6 +342,23 @@ def test_the_cases_of_a_page_are_in_the_file_beside_it(tmp_path):
     assert found['class'] == 'creep, thermal_drift'
     assert found['size (left by a refit)'] == '0.40 (0.30), 0.10 (0.05)'
     assert found['outcome'] == study.outcome(row)
+
+
+def test_rows_that_were_kept_before_are_counted(tmp_path):
+    (case,) = (c for c in cases.sum_cases('first-sums') if c.key == 'one creep 0.3 1 white')
+    kept = {'key': case.key, 'verdict': 'named', 'found': ['creep'], 'group': [], 'size': 0.31}
+    (tmp_path / 'rows.jsonl').write_text(json.dumps(kept | {'unseen_before': 0.4}) + '\n')
+    rows = read_rows(tmp_path / 'rows.jsonl', study.Row)
+    row = study.with_truth(rows[case.key], case)
+    assert row.truth == {'creep': 0.31} and row.centred_before == 0.4
+    assert study.outcome(row) == 'named'
+
+
+def test_an_effect_that_is_no_candidate_is_not_asked_for():
+    row = study.Row('outside memory_fade 0.3 21 white', 'unexplained', truth={'memory_fade': 0.3})
+    row = replace(row, misfit=0.1, left=row.truth)
+    assert study.outcome(row) == 'abstained' and not study.is_candidate(row)
+    assert 'no candidate: a false name | 0 of 1' in study.summary([row])
 
 
 @pytest.mark.parametrize('name', ['diagnosis_study', 'diagnosis_study_foreign'])

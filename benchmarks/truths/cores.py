@@ -14,6 +14,7 @@ Springer 1994, chapter IV.  Everything is in parts of the span.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 
@@ -22,11 +23,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Rng = np.random.Generator
+Law = Callable[[Array], Array]
 
 #: thresholds of a dense row of plays
 PLAYS = 240
 #: remembered extremes before the smallest loops are forgotten
 DEPTH = 8192
+#: longest step of a differential law, in parts of the range; longer ones are divided
+STEP = 2e-3
+
+
+def law_of(kernel: Callable[..., None], *parameters: float | Array) -> Law:
+    """Return a law that a compiled loop computes, kernel(u, *parameters, out)."""
+
+    def law(u: Array) -> Array:
+        out = np.empty(u.size)
+        kernel(np.ascontiguousarray(u), *parameters, out)
+        return out
+
+    return law
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The laws of the effects, none of them in the form that the package fits.  Parts of the span."""
+"""
+The laws of the effects, none of them in the form that the package fits.  Parts of the span.
+
+Each law has up to three forms, of which a stage has one.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,10 @@ def _charged(u: Array, tau: float, growth: float, step: float, out: Array) -> No
 
 
 def charged(u: Array, tau: float, variant: int, rate: float = RATE) -> Array:
-    """Return the voltage on a capacitance that grows with it, or behind two equal lags."""
+    """Return the voltage on a capacitance that grows with it, or behind two lags."""
+    if variant == 2:
+        first = lag(u, 1.0 / (2 * math.pi * 0.8 * tau), rate=rate)
+        return lag(first, 1.0 / (2 * math.pi * 0.2 * tau), rate=rate)
     if variant == 1:
         return lag(u, 1.0 / (np.pi * tau), order=2, rate=rate)
     out = np.empty(u.size)
@@ -67,7 +74,9 @@ def current_limited(u: Array, slew: float, variant: int, rate: float = RATE) -> 
 
 
 def limited(u: Array, depth: float, variant: int) -> Array:
-    """Return u behind a limiter that loses `depth` at 1: algebraic, or with a Gaussian knee."""
+    """Return u, `depth` of it lost at 1: by an algebraic limiter, a Gaussian knee, a parabola."""
+    if variant == 2:
+        return np.asarray(u - depth * (np.maximum(u - 0.75, 0.0) / 0.25) ** 2)
     if variant == 0:
         # (1 + s^-16)^(-1/16) = 1 - depth fixes the level s at which it saturates
         level = ((1.0 - depth) ** -16 - 1.0) ** (-1 / 16)
@@ -91,17 +100,36 @@ def bent(u: Array, amount: float, variant: int) -> Array:
 
 
 def hinge(u: Array, amount: float, variant: int) -> Array:
-    """Return the stroke lost to a contact that opens below a voltage: soft, or of Hertz's law."""
+    """Return the stroke lost to a contact that opens: soft, of Hertz's law, or a square."""
+    if variant == 2:
+        return np.asarray(-amount * np.maximum(0.45 - u, 0.0) ** 2)
     at, soft = (0.3, 0.02) if variant == 0 else (0.35, 0.0)
     if variant == 0:
         return np.asarray(-amount * soft * np.logaddexp(0.0, (at - u) / soft))
     return np.asarray(-amount * np.maximum(at - u, 0.0) ** 1.5)
 
 
-def speed_of(u: Array, corner: float = 400.0) -> Array:
-    """Return the smoothed speed of u in spans a second."""
-    du = np.diff(u, prepend=u[0]) * RATE
-    return np.abs(lag(du, corner))
+def velocity(u: Array, corner: float = 400.0, rate: float = RATE) -> Array:
+    """Return the smoothed velocity of u in spans a second."""
+    return lag(np.diff(u, prepend=u[0]) * rate, corner, rate=rate)
+
+
+def spent_on_speed(u: Array, amount: float, variant: int, rate: float) -> Array:
+    """
+    Return the part of the drive that speed takes, `amount` of the span at 100 spans/s.
+
+    Variant 0 is the excess loss of magnetic cores, amount sqrt(speed) (Bertotti, IEEE Trans.
+    Magn. 24 (1988) 621); variant 1 grows as the logarithm, as thermally activated walls do.
+    """
+    # well below this one [spans/s] the speed counts as slow
+    slow = 2.0
+    speed = velocity(u, 600.0, rate)
+    size = np.abs(speed)
+    way = speed / (size + 0.1 * slow)
+    grown = (
+        np.sqrt(size / 100.0) if variant == 0 else np.log1p(size / slow) / np.log1p(100.0 / slow)
+    )
+    return np.asarray(amount * way * grown)
 
 
 def drift(t: Array, amount: float, variant: int, rng: Rng) -> Array:
@@ -120,7 +148,12 @@ def drift(t: Array, amount: float, variant: int, rng: Rng) -> Array:
 
 
 def hum(t: Array, amount: float, variant: int, rng: Rng) -> Array:
-    """Return mains hum: a clipped sine near 50 Hz, or a rounded triangle near 60 Hz."""
+    """Return mains hum: a clipped sine near 50 Hz, a rounded triangle near 60 Hz, harmonics."""
+    if variant == 2:
+        total = np.zeros(t.size)
+        for order, share in ((1, 1.0), (2, 0.3), (3, 0.5), (5, 0.2)):
+            total += share * np.sin(2 * np.pi * 49.98 * order * t + rng.uniform(0, 2 * np.pi))
+        return np.asarray(amount * total)
     frequency = 50.03 if variant == 0 else 59.96
     phase = rng.uniform(0, 2 * np.pi)
     s = np.sin(2 * np.pi * frequency * t + phase)
@@ -142,7 +175,10 @@ def _friction(y: Array, reach: float, stribeck: float, rate: float, out: Array) 
 
 
 def friction(y: Array, amount: float, variant: int, rate: float = RATE) -> Array:
-    """Return what a guide with friction takes from the motion: Dahl's law, or LuGre's."""
+    """Return what a guide takes from the motion: Dahl's law, LuGre's, two bristles of Dahl's."""
+    if variant == 2:
+        both = friction(y, amount, 0, rate) + friction(2.5 * y, amount, 0, rate)
+        return np.asarray(0.5 * both)
     out = np.empty(y.size)
     reach, stribeck = (0.004, 0.008)[variant], (0.0, 0.15)[variant]
     _friction(np.ascontiguousarray(y), reach, stribeck, rate, out)
@@ -150,7 +186,9 @@ def friction(y: Array, amount: float, variant: int, rate: float = RATE) -> Array
 
 
 def bridge(y: Array, amount: float, variant: int) -> Array:
-    """Return a sensor's reading: a Wheatstone bridge y / (1 + e y), or an inverse tangent."""
+    """Return a sensor's reading: of a Wheatstone bridge, an inverse tangent, or an LVDT."""
+    if variant == 2:
+        return np.asarray(y - amount * np.abs(y - 0.3) ** 2.5 * np.sign(y - 0.3))
     if variant == 0:
         return np.asarray(y * (1.0 + amount) / (1.0 + amount * y))
     x = y - 0.35
@@ -159,13 +197,17 @@ def bridge(y: Array, amount: float, variant: int) -> Array:
 
 def fed_through(u: Array, amount: float, variant: int, rate: float = RATE) -> Array:
     """Return the drive's own voltage in the reading: through a capacitance, and a resistance."""
+    if variant == 2:
+        return np.asarray(amount * (4.0 * (u - lag(u, 800.0, rate=rate)) + 0.05 * u))
     corner = (3000.0, 1500.0)[variant]
     coupled = u - lag(u, corner, rate=rate)
     return np.asarray(amount * (8.0 * coupled + (0.1, 0.02)[variant] * u))
 
 
 def wander(t: Array, amount: float, variant: int, rng: Rng) -> Array:
-    """Return a smooth random walk of the gain, zero at t = 0: 1/f^2 lines, or a bounded one."""
+    """Return a gain that wanders from zero at t = 0: 1/f^2 lines, bounded ones, warming up."""
+    if variant == 2:
+        return np.asarray(amount * -np.expm1(-t / rng.uniform(3.0, 20.0)))
     period = rng.uniform(0.9, 1.1, 16) * np.geomspace(4.0, 80.0, 16)
     size = rng.standard_normal(16) * (period if variant == 0 else np.sqrt(period))
     phase = rng.uniform(0, 2 * np.pi, 16)

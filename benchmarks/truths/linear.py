@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import firwin, freqz, lfilter
 
-from .cores import Array
+from .cores import Array, Rng
 
 #: internal sampling rate [Hz]
 RATE = 20000.0
@@ -158,6 +158,62 @@ class ARX:
         return b * a.sum() / b.sum(), a
 
 
+@dataclass(frozen=True)
+class Linear:
+    """
+    Modes side by side, a sensor's pole, a delay.
+
+    Attributes
+    ----------
+    modes : tuple of (frequency [Hz], damping ratio, share)
+        The shares add up to 1; neighbours of one sign have an antiresonance between them.
+    pole : float
+        Corner of the sensor [Hz].
+    delay : float
+        [s], of any fraction of a sample.
+    """
+
+    modes: tuple[tuple[float, float, float], ...]
+    pole: float
+    delay: float
+
+    def __call__(self, h: Array, rate: float, later: float = 0.0) -> Array:
+        """Return the answer to h held between samples, from rest at h[0]."""
+        x = h - h[0]
+        total = np.zeros(h.size)
+        for frequency, zeta, share in self.modes:
+            w = 2 * math.pi * frequency
+            whole = np.zeros((3, 3))
+            whole[0, 1], whole[1, 0], whole[1, 1], whole[1, 2] = w, -w, -2 * zeta * w, w
+            held = expm(whole / rate)
+            a1, a2 = -float(np.trace(held[:2, :2])), float(np.linalg.det(held[:2, :2]))
+            # the first two samples of the answer to a pulse
+            first = float(held[0, 2])
+            second = float(held[0, :2] @ held[:2, 2])
+            total += share * lfilter([0.0, first, second + a1 * first], [1.0, a1, a2], x)
+        pole = math.exp(-2 * math.pi * self.pole / rate)
+        y = lfilter([1.0 - pole], [1.0, -pole], total)
+        return np.asarray(delayed(y, self.delay + later, rate) + h[0])
+
+
+def make_linear(rng: Rng, rate: float, highest: float = 1500.0) -> Linear:
+    """Draw two or three light modes, a sensor's pole and a delay of 0 to 6 samples."""
+    top = 0.38 * rate
+    first = math.exp(rng.uniform(math.log(200.0), math.log(min(highest, top / 1.7))))
+    places, frequency = [first], first
+    for _ in range(int(rng.integers(1, 3))):
+        frequency *= rng.uniform(1.6, 2.8)
+        if frequency < top:
+            places.append(frequency)
+    # the lowest mode carries most; a higher one of its sign makes an antiresonance
+    shares = rng.uniform(0.03, 0.2, len(places)) * rng.choice([1.0, 1.0, -1.0], len(places))
+    shares[0] = 1.0 - shares[1:].sum()
+    zetas = np.exp(rng.uniform(math.log(0.005), math.log(0.05), len(places)))
+    modes = tuple(zip(map(float, places), map(float, zetas), map(float, shares), strict=True))
+    pole = rng.uniform(0.15, 0.4) * rate
+    return Linear(modes, pole, rng.uniform(0.0, 6.0) / rate)
+
+
 def ridden(h: Array, change: float, frequency: float) -> Array:
     """
     Return what is added when a part of the motion goes through a mode of its own.
@@ -257,3 +313,11 @@ def band(rng: np.random.Generator, n: int, low: float, high: float) -> Array:
     kernel = firwin(taps, [low, high], pass_zero=False, fs=RATE)
     x = np.convolve(rng.standard_normal(n + taps - 1), kernel, mode='valid')
     return np.asarray(x / max(float(x.std()), 1e-12))
+
+
+def pink(white: Array) -> Array:
+    """Return white noise with a density of 1/f."""
+    spectrum = np.fft.rfft(white)
+    spectrum[0] = 0.0
+    spectrum[1:] /= np.sqrt(np.arange(1, spectrum.size))
+    return np.asarray(np.fft.irfft(spectrum, white.size))

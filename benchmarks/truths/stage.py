@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stages whose laws are known here and nowhere else."""
+"""Stages whose hysteresis is a sum of plays, at rest at 0 V before each record."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import laws
-from .cores import Array, Density, everett, plays
-from .linear import ARX, Cascade, delayed, RATE, relaxation, ridden
+from .cores import Array, Density, everett, plays, Rng
+from .effects import Affected, Gains
+from .linear import ARX, Cascade, delayed, pink, RATE, ridden
 from .table import EFFECTS, gain_of, LATER, OUTSIDE, VARIANTS
 
 #: displacement [m] and voltage [V] of the whole range
 SPAN = 75e-6
 VOLTS = 10.0
-
+NOISES = ('white', '1/f', '10-bit', 'none')
 #: these need thresholds one by one; the others leave the core as it is
 _PLAYS = ('rate_dependent_hysteresis', 'memory_fade')
 
@@ -56,10 +57,6 @@ class Base:
         c1, c3, c5 = self.polynomial
         square = u * u
         return np.asarray(u * (c1 + square * (c3 + square * c5)))
-
-    def carry(self, h: Array) -> Array:
-        """Return what dynamics and delay make of the output of the hysteresis block."""
-        return delayed(self.dynamics(h), self.delay)
 
 
 def make_base(seed: int) -> Base:
@@ -96,7 +93,7 @@ def make_base(seed: int) -> Base:
 
 
 @dataclass(frozen=True)
-class Stage:
+class Stage(Affected):
     """
     A stage, perhaps with effects, behind a sampled sensor.
 
@@ -109,6 +106,8 @@ class Stage:
         Which form of its law every effect takes.
     seed : int
     noise : {'white', '1/f', '10-bit', 'none'}
+        White, or with a density of 1/f, of the same rms over a record; or white, and then rounded
+        to 1/1024 of the span.
     noise_rms : float
         Share of the span.
     """
@@ -119,10 +118,7 @@ class Stage:
     seed: int = 0
     noise: str = 'none'
     noise_rms: float = 2e-5
-
-    def without_effects(self) -> Stage:
-        """Return the same stage without effects; the core keeps the form that they needed."""
-        return replace(self, gains=MappingProxyType({}))
+    rate = RATE
 
     def respond(
         self,
@@ -154,72 +150,23 @@ class Stage:
         """
         time = np.asarray(t, dtype=np.float64)
         volts = np.ascontiguousarray(v, dtype=np.float64)
-        others = {
-            k: np.ascontiguousarray(x, dtype=np.float64) for k, x in (channels or {}).items()
-        }
+        other = (channels or {}).get('other')
+        if other is not None:
+            other = np.ascontiguousarray(other, dtype=np.float64) / VOLTS
         # a record's own draws: its phases are not those of the next
         key = zlib.crc32(volts.tobytes())
+
+        def draw(name: str) -> Rng:
+            return np.random.default_rng([zlib.crc32(name.encode()), self.seed, key, take])
+
         gains = {n: g for n, g in self.gains.items() if changed or n not in LATER}
-        y = self._displacement(time, volts / VOLTS, gains, others, (key, take))
+        y = self.displacement(time, volts / VOLTS, gains, other, draw)
         if not clean:
             y = y + self._sensor_noise(y, np.random.default_rng([3, self.seed, key, take]))
         return np.asarray(y * SPAN)
 
-    def _displacement(
-        self,
-        t: Array,
-        u: Array,
-        gains: Mapping[str, float],
-        channels: Mapping[str, Array],
-        key: tuple[int, int],
-    ) -> Array:
-        def draw(name: str) -> np.random.Generator:
-            return np.random.default_rng([zlib.crc32(name.encode()), self.seed, *key])
-
-        kind = self.variants
-        drive = self._amplifier(u, gains)
-        h = self._hysteresis(drive, gains)
-        if 'creep' in gains:
-            h = relaxation(h, ('log', 'power')[kind['creep']], gains['creep'])
-        if 'asymmetric_relaxation' in gains:
-            h = relaxation(h, 'log', gains['asymmetric_relaxation'], up=0.0)
-        if 'preload_loss' in gains:
-            h = h + laws.hinge(drive, gains['preload_loss'], kind['preload_loss'])
-        y = self._motion(h, gains)
-        if 'backlash' in gains:
-            y = y + laws.friction(y, gains['backlash'], kind['backlash'])
-        if 'gain_drift' in gains:
-            walk = laws.wander(t, gains['gain_drift'], kind['gain_drift'], draw('gain_drift'))
-            y = y * (1.0 + walk)
-        if 'cross_coupling' in gains and 'other' in channels:
-            y = y + gains['cross_coupling'] * self._other(channels['other'] / VOLTS)
-        for name, law in (('thermal_drift', laws.drift), ('periodic_disturbance', laws.hum)):
-            if name in gains:
-                y = y + law(t, gains[name], kind[name], draw(name))
-        if 'stick_jumps' in gains:
-            y = y + laws.jumps(u, gains['stick_jumps'], draw('stick_jumps'))
-        if 'floor_vibration' in gains:
-            y = y + laws.vibration(u.size, gains['floor_vibration'], draw('floor_vibration'))
-        if 'input_ripple' in gains:
-            y = y + laws.ripple(t, u, gains['input_ripple'], draw('input_ripple'))
-        if 'sensor_nonlinearity' in gains:
-            y = laws.bridge(y, gains['sensor_nonlinearity'], kind['sensor_nonlinearity'])
-        if 'input_feedthrough' in gains:
-            y = y + laws.fed_through(u, gains['input_feedthrough'], kind['input_feedthrough'])
-        return y
-
-    def _amplifier(self, u: Array, gains: Mapping[str, float]) -> Array:
-        if 'slew_limit' in self.variants:
-            slew = gains.get('slew_limit', math.inf)
-            u = laws.current_limited(u, slew, self.variants['slew_limit'])
-        if 'saturation' in gains:
-            u = laws.limited(u, gains['saturation'], self.variants['saturation'])
-        if 'amplifier_lag' in gains:
-            u = laws.charged(u, gains['amplifier_lag'], self.variants['amplifier_lag'])
-        return u
-
-    def _hysteresis(self, u: Array, gains: Mapping[str, float]) -> Array:
-        base, kind = self.base, self.variants
+    def hysteresis(self, drive: Array, gains: Gains) -> Array:
+        u, base, kind = drive, self.base, self.variants
         h = base.single_valued(u)
         if 'even_nonlinearity' in gains:
             h = h + laws.bent(u, gains['even_nonlinearity'], kind['even_nonlinearity'])
@@ -229,7 +176,7 @@ class Stage:
         low = high = None
         follow, rate = 1.0, gains.get('rate_dependent_hysteresis', 0.0)
         if rate:
-            variant, speed = kind['rate_dependent_hysteresis'], laws.speed_of(u)
+            variant, speed = kind['rate_dependent_hysteresis'], np.abs(laws.velocity(u))
             if variant == 2:
                 follow = -math.expm1(-1.0 / (RATE * rate))
             else:
@@ -239,7 +186,7 @@ class Stage:
         forget = -math.expm1(-gains.get('memory_fade', 0.0) / RATE)
         return h + plays(u, base.density, low, high, follow=follow, forget=forget, curve=kappa)
 
-    def _motion(self, h: Array, gains: Mapping[str, float]) -> Array:
+    def motion(self, h: Array, gains: Gains) -> Array:
         dynamics, delay = self.base.dynamics, self.base.delay
         amount = gains.get('changed_dynamics', 0.0)
         if amount and self.variants['changed_dynamics'] == 0 and isinstance(dynamics, Cascade):
@@ -249,21 +196,18 @@ class Stage:
             y = y + ridden(h, amount, 260.0 + 14.0 * (self.seed % 7))
         return delayed(y, delay + gains.get('delay_change', 0.0))
 
-    def _other(self, u: Array) -> Array:
+    def other_axis(self, other: Array) -> Array:
         density = make_base(self.seed + 1000).density
-        moved = 0.8 * u + everett(np.maximum(u, 0.0), density)
+        moved = 0.8 * other + everett(np.maximum(other, 0.0), density)
         frequency = 180.0 + 60.0 * (self.seed % 5)
         return Cascade(((frequency, 0.04, 1.0),), (2500.0,))(moved)
 
-    def _sensor_noise(self, y: Array, rng: np.random.Generator) -> Array:
+    def _sensor_noise(self, y: Array, rng: Rng) -> Array:
         if self.noise == 'none' or self.noise_rms == 0:
             return np.zeros(y.size)
         white = rng.standard_normal(y.size)
         if self.noise == '1/f':
-            spectrum = np.fft.rfft(white)
-            spectrum[0] = 0.0
-            spectrum[1:] /= np.sqrt(np.arange(1, spectrum.size))
-            coloured = np.fft.irfft(spectrum, y.size)
+            coloured = pink(white)
             return np.asarray(self.noise_rms * coloured / coloured.std())
         noise = self.noise_rms * white
         if self.noise == '10-bit':
@@ -291,8 +235,6 @@ def make_stage(
     seed : int
         Of the stage, and of the form of each law.
     noise : {'white', '1/f', '10-bit', 'none'}
-        White, or with a density of 1/f, of the same rms over a record; or white, and then rounded
-        to 1/1024 of the span.
     noise_rms : float
         Share of the span.
 
@@ -305,8 +247,8 @@ def make_stage(
     for name in names:
         if name not in EFFECTS + OUTSIDE:
             raise ValueError(f'no law for {name!r}; there are {", ".join(EFFECTS + OUTSIDE)}')
-    if noise not in ('white', '1/f', '10-bit', 'none'):
-        raise ValueError(f'noise must be white, 1/f, 10-bit or none, got {noise!r}')
+    if noise not in NOISES:
+        raise ValueError(f'noise must be one of {NOISES}, got {noise!r}')
     kind = {n: seed % VARIANTS[n] for n in names}
     base = make_base(seed)
     if kind.get('changed_dynamics') == 0 and isinstance(base.dynamics, ARX):

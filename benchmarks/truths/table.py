@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-#: left-over sizes [% of stroke, rms] at which the gains below were found, see `truths.leftover`
+#: left-over sizes [% of stroke, rms] at which the gains below were found
 STRENGTHS = (0.1, 0.3, 1.0)
 
 #: of each effect its variants, of which the seed of a stage chooses one: the law, and its gain at
@@ -151,6 +151,34 @@ LATER = (
     'input_feedthrough',
     'delay_change',
     'gain_drift',
+)
+
+
+#: what sets in behind the identification of a stage of another family: G would have swallowed it,
+#: or H, as it follows the path
+SETS_IN = (
+    *LATER,
+    'backlash',
+    'even_nonlinearity',
+    'noncongruent_minor_loops',
+    'preload_loss',
+    'saturation',
+    'sensor_nonlinearity',
+)
+#: the forms of the laws on stages of another family
+FAMILY_VARIANTS = {**VARIANTS, 'rate_dependent_hysteresis': 2, 'noncongruent_minor_loops': 1}
+#: the effects with one form more, for all sets but that of the tuning
+FURTHER = (
+    'saturation',
+    'amplifier_lag',
+    'noncongruent_minor_loops',
+    'preload_loss',
+    'changed_dynamics',
+    'backlash',
+    'gain_drift',
+    'periodic_disturbance',
+    'sensor_nonlinearity',
+    'input_feedthrough',
 )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 import yaml
 
 from .cores import Array, plays, Row
-from .laws import speed_of
+from .laws import velocity
 from .linear import ARX, delayed, RATE, relaxation
 from .stage import SPAN, VOLTS
 
@@ -71,7 +71,7 @@ class TableOneStage:
         core, rate, creep = (self.parameters[k] for k in ('hysteresis', 'rate', 'creep'))
         u = volts / VOLTS
         row = Row(np.array(core['thresholds']), np.array(core['weights']))
-        speed = speed_of(u, rate['corner'])
+        speed = np.abs(velocity(u, rate['corner']))
         # an arc tangent, which is none of the candidate's laws
         wider = rate['gain'] * 2.0 / np.pi * np.arctan(speed / rate['speed'])
         h = u * (core['p2'] + core['p1'] * u * u) + plays(u, row, wider, additive=True)

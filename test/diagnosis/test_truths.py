@@ -4,16 +4,17 @@
 """The stages that judge a diagnosis: independent, repeatable, of the wanted size."""
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 import sys
 
 import numpy as np
 import pytest
 import truths
-from truths.cores import everett, plays
-from truths.leftover import base_of, left_over
+from truths.cores import everett, plays, Row
 from truths.linear import Cascade, delayed, RATE, relaxation
-from truths.stage import make_base
+from truths.references import remainder
+from truths.stage import make_base, VOLTS
 from truths.table_one import table_one_stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,14 +70,23 @@ def test_what_sets_in_later_was_not_there_before(name, short):
     assert np.std(stage.respond(t, v) - before) > 0
 
 
+def refits(base, v):
+    """Return what a refit of offset, v, v^3 and 40 plays can do, every eighth sample."""
+    u, rows = v / VOLTS, (np.arange(40) + 0.5) / 40
+    parts = [u, u**3, *(plays(u, Row(np.array([r]), np.ones(1))) for r in rows)]
+    columns = [np.ones(u.size), *(delayed(base.dynamics(x), base.delay) for x in parts)]
+    return np.stack([x[::8] for x in columns], axis=1)
+
+
 def test_the_size_of_every_effect(record):
     t, v, _, other = record
-    basis = base_of(make_base(1), v)
+    X = refits(make_base(1), v)
     for name in NAMES:
         stage = truths.make_stage(name, 0.3, 1)
-        raw, left = left_over(stage, t, v, {'other': other}, basis)
-        assert 0.1 < left < 0.9, f'{name}: {left:.3f} % of stroke is left of {raw:.3f}'
-        assert raw >= left
+        y = stage.respond(t, v, channels={'other': other}, clean=True)
+        plain = replace(stage, gains={}).respond(t, v, clean=True)
+        left = 100 * remainder(X, (y - plain)[::8]) / np.ptp(plain)
+        assert 0.1 < left < 0.9, f'{name}: {left:.3f} % of stroke is left'
 
 
 def test_the_base_is_one_that_plays_can_follow(record):
@@ -84,8 +94,7 @@ def test_the_base_is_one_that_plays_can_follow(record):
     for seed in range(3):
         stage = truths.make_stage(None, 0.0, seed)
         y = stage.respond(t, v, clean=True)[::8]
-        Q = base_of(stage.base, v)
-        assert np.std(y - Q @ (Q.T @ y)) < 3e-4 * np.ptp(y)
+        assert remainder(refits(stage.base, v), y) < 3e-4 * np.ptp(y)
         assert 0.1 < stage.base.density.width() < 0.15
 
 

@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 from scipy.signal import firwin, lfilter
-from truths.programs import Label, Tape
 
 from .cores import Array, Rng
+from .tape import Label, Tape
 
 #: top speed of the moves between segments [spans/s]
 SPEED = 4.0

@@ -10,10 +10,10 @@ import math
 import numpy as np
 
 from .cores import Array
-from .stage import Stage
+from .family_stage import FamilyStage
 
 #: of each law the parameter that hardly shows, and the largest that a stage would have; see
-#: `truths.laws` and `stage`
+#: `laws` and `family_stage`
 AMOUNTS = {
     'creep': (1e-5, 0.012),
     'thermal_drift': (1e-5, 0.06),
@@ -56,14 +56,14 @@ def size_of(change: Array, without: Array) -> float:
 
 
 def scaled(
-    stage: Stage, effect: str, wanted: float, v: Array, other: Array | None = None
+    stage: FamilyStage, effect: str, wanted: float, v: Array, other: Array | None = None
 ) -> tuple[float, float]:
     """
     Return the parameter of an effect and the size that it has on the diagnosis record.
 
     Parameters
     ----------
-    stage : Stage
+    stage : FamilyStage
     effect : str
     wanted : float
         Size [% of stroke], kept within `LEAST` and `LARGEST` and what the law may reach.

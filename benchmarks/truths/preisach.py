@@ -2,29 +2,103 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Laws of the known set, which the diagnosis may be tuned on.
+Hysteresis by the extremes that it remembers, over 0 .. 1.
 
-- Preisach operators whose relays lie in Gaussian and Lorentzian hills,
-- a few Krasnosel'skii-Pokrovskii kernels (Systems with Hysteresis, Springer 1989),
-- Jiles and Atherton's law (J. Magn. Magn. Mater. 61 (1986) 48),
-- the law of Bouc and Wen with a term for each way (Wang, Wen, J. Eng. Mech. 126 (2000) 1092),
-- Dahl's law with an exponent and a stiffness that goes with the bias (Dahl, AIAA J. 14 (1976)
-  1675), a form of Duhem's equation,
-- curves from each turning point to the one before, bent by their length (after Bashash, Jalili,
+- The Preisach operator with an uneven density of its relays, or with hills of them, exact through
+  its Everett function (Mayergoyz, Mathematical Models of Hysteresis, Springer 1991, chapter 1).
+- A few Krasnosel'skii-Pokrovskii kernels (Systems with Hysteresis, Springer 1989).
+- Curves from each turning point to the one before, bent by their length (after Bashash, Jalili,
   J. Appl. Phys. 100 (2006) 014103).
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 from numba import njit
 import numpy as np
 
-from .cores import Array, bouc_wen_of, DEPTH, Law, law_of, preisach, Rng, STEP
+from .cores import Array, DEPTH, extremes_left, Law, law_of, Rng
 
+#: cells of the relay plane on each axis; the density is even within a cell
+CELLS = 400
 #: Krasnosel'skii-Pokrovskii kernels on each axis
 KERNELS = 7
+
+
+def everett_table(density: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
+    """
+    Return the Everett function on the corners of `CELLS` x `CELLS` cells, and their densities.
+
+    Parameters
+    ----------
+    density : callable
+        Of the relays that rise at a and fall at b <= a, both 0 .. 1.
+    """
+    middle = (np.arange(CELLS) + 0.5) / CELLS
+    a, b = np.meshgrid(middle, middle, indexing='ij')
+    mu = np.where(a >= b, np.maximum(density(a, b), 0.0), 0.0)
+    cell = mu / CELLS**2
+    cell[np.diag_indices(CELLS)] *= 0.5
+    table = np.zeros((CELLS + 1, CELLS + 1))
+    # E(a, b): all relays with b <= their b and their a <= a
+    table[1:, :-1] = np.cumsum(np.cumsum(cell, axis=0)[:, ::-1], axis=1)[:, ::-1]
+    return np.ascontiguousarray(table), np.ascontiguousarray(np.diag(mu))
+
+
+@njit(cache=True, nogil=True)
+def _everett(a: float, b: float, table: Array, diagonal: Array) -> float:
+    """Return the Everett function, exact for a density that is even in each cell."""
+    cells = diagonal.size
+    x, y = a * cells, b * cells
+    i, j = min(int(x), cells - 1), min(int(y), cells - 1)
+    if i == j:
+        return 0.5 * diagonal[i] * (a - b) * (a - b)
+    s, t = x - i, y - j
+    low = table[i, j] + (table[i, j + 1] - table[i, j]) * t
+    high = table[i + 1, j] + (table[i + 1, j + 1] - table[i + 1, j]) * t
+    # the cells that the diagonal cuts bend the edges of all cells in their row and column
+    bent = diagonal[i] * s * (1.0 - s) + diagonal[j] * t * (1.0 - t)
+    return low + (high - low) * s - 0.5 * bent / (cells * cells)
+
+
+@njit(cache=True, nogil=True)
+def _preisach(u: Array, table: Array, diagonal: Array, out: Array) -> None:
+    extreme, value = np.empty(DEPTH), np.empty(DEPTH)
+    extreme[0], value[0] = 0.0, 0.0
+    n, x, h = 1, 0.0, 0.0
+    for k in range(u.size):
+        new = min(max(u[k], 0.0), 1.0)
+        if new != x:
+            n = extremes_left(new, x, h, n, extreme, value)
+            last = extreme[n - 1]
+            if new > last:
+                h = value[n - 1] + _everett(new, last, table, diagonal)
+            else:
+                h = value[n - 1] - _everett(last, new, table, diagonal)
+            x = new
+        out[k] = h
+
+
+def preisach(density: Callable[[Array, Array], Array]) -> Law:
+    """Return the Preisach operator of a density of relays, from all relays down."""
+    table, diagonal = everett_table(density)
+    return law_of(_preisach, table, diagonal)
+
+
+def uneven(rng: Rng) -> Law:
+    """Draw a Preisach operator whose density falls with the width, and leans with the bias."""
+    reach = rng.uniform(0.08, 0.35)
+    lean, bow = rng.uniform(0.15, 0.5) * rng.choice([-1.0, 1.0]), rng.uniform(-0.5, 0.5)
+    spot, at, broad = rng.uniform(0.0, 1.0), rng.uniform(0.25, 0.75), rng.uniform(0.1, 0.25)
+
+    def density(a: Array, b: Array) -> Array:
+        width, bias = a - b, a + b - 1.0
+        fall = np.exp(-width / reach)
+        hill = np.exp(-((0.5 * (a + b) - at) ** 2 + 0.5 * (width - 0.15) ** 2) / broad**2)
+        return np.asarray(fall * (1.0 + lean * bias + bow * bias**2) + spot * 0.3 * hill)
+
+    return preisach(density)
 
 
 def hills(rng: Rng) -> Law:
@@ -74,69 +148,6 @@ def krasnoselskii_pokrovskii(rng: Rng) -> Law:
     weight = np.exp(-(up - down) / reach) * (1.0 + lean * (up + down - 1.0))
     weight *= rng.uniform(0.85, 1.15, up.size)
     return law_of(_kernels, up, down, ramp, weight)
-
-
-@njit(cache=True, nogil=True)
-def _langevin(x: float) -> float:
-    return x / 3.0 if abs(x) < 1e-3 else 1.0 / math.tanh(x) - 1.0 / x
-
-
-@njit(cache=True, nogil=True)
-def _jiles_atherton(
-    u: Array, a: float, pinning: float, coupling: float, give: float, out: Array
-) -> None:
-    # dM_irr/dH = (M_an - M_irr) / (k delta - alpha (M_an - M_irr)), never against the field
-    irreversible, m, last = 0.0, 0.0, u[0]
-    for k in range(u.size):
-        du = u[k] - last
-        parts = int(abs(du) / STEP) + 1
-        d = 2.0 * du / parts
-        way = 1.0 if du > 0.0 else -1.0
-        for i in range(parts if du != 0.0 else 0):
-            field = 2.0 * (last + (i + 0.5) * du / parts) - 1.0
-            ideal = _langevin((field + coupling * m) / a)
-            gap = ideal - irreversible
-            if gap * way > 0.0:
-                irreversible += d * gap / (way * pinning - coupling * gap)
-            m = give * ideal + (1.0 - give) * irreversible
-        last = u[k]
-        out[k] = m
-
-
-def jiles_atherton(rng: Rng) -> Law:
-    """Draw the law of Jiles and Atherton, far from saturation."""
-    a, pinning = rng.uniform(0.6, 1.5), rng.uniform(0.3, 0.9)
-    coupling, give = rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.4)
-    return law_of(_jiles_atherton, a, pinning, coupling, give)
-
-
-def skewed_bouc_wen(rng: Rng) -> Law:
-    """Draw the law of Bouc and Wen, its rises unlike its falls."""
-    skew = rng.uniform(0.05, 0.2) * rng.choice([-1.0, 1.0])
-    beta = rng.uniform(0.6, 1.0)
-    return bouc_wen_of(rng.uniform(1.5, 6.0), beta, 1.0 - beta, rng.uniform(1.0, 1.8), skew)
-
-
-@njit(cache=True, nogil=True)
-def _dahl(u: Array, rate: float, power: float, lean: float, out: Array) -> None:
-    z, last = 0.0, u[0]
-    for k in range(u.size):
-        du = u[k] - last
-        if du != 0.0:
-            parts = int(abs(du) / STEP) + 1
-            d, way = du / parts, 1.0 if du > 0.0 else -1.0
-            for i in range(parts):
-                x = last + (i + 0.5) * d
-                stiff = rate * (1.0 + lean * (2.0 * x - 1.0))
-                z += d * stiff * max(1.0 - z * way, 0.0) ** power
-        last = u[k]
-        out[k] = -z
-
-
-def dahl(rng: Rng) -> Law:
-    """Draw Dahl's law, stiffer at one end."""
-    rate, power, lean = rng.uniform(1.0, 5.0), rng.uniform(0.8, 2.2), rng.uniform(-0.4, 0.4)
-    return law_of(_dahl, rate, power, lean)
 
 
 @njit(cache=True, nogil=True)

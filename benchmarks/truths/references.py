@@ -13,8 +13,9 @@ from scipy.linalg import qr, solve_triangular
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.optimize import lsq_linear
 
-from .cores import Array, play
-from .stage import Stage
+from .cores import Array
+from .families import play
+from .family_stage import FamilyStage
 
 #: rows that are fitted at most
 ROWS = 30_000
@@ -37,13 +38,13 @@ def _columns(u: Array, form: str) -> tuple[list[Array], int]:
     return [*plays, u**3, *([u**2] if form == 'and a square' else [])], count
 
 
-def basis(stage: Stage, v: Array, name: str, form: str) -> tuple[Array, int]:
+def basis(stage: FamilyStage, v: Array, name: str, form: str) -> tuple[Array, int]:
     """
     Return the columns of a form behind the stage's linear part, with an offset, thinned.
 
     Parameters
     ----------
-    stage : Stage
+    stage : FamilyStage
     v : ndarray, shape (n,)
         [V]
     name : str
@@ -79,7 +80,7 @@ def _error(X: Array, y: Array, weights: Array) -> float:
 
 
 def references(
-    stage: Stage,
+    stage: FamilyStage,
     records: Mapping[str, tuple[Array, Array]],
     forms: tuple[str, ...] = FORMS,
     sweeps: Sequence[tuple[int, int]] = (),
@@ -93,7 +94,7 @@ def references(
 
     Parameters
     ----------
-    stage : Stage
+    stage : FamilyStage
     records : mapping of str to (v, y)
         Identification and unseen: command [V], and displacement in parts of the stroke.
     forms : tuple of str, optional
@@ -117,7 +118,7 @@ def references(
     return found
 
 
-def _moved(stage: Stage, v: Array) -> NDArray[np.bool_]:
+def _moved(stage: FamilyStage, v: Array) -> NDArray[np.bool_]:
     """Return the thinned samples about which the voltage sweeps a third of its range."""
     stride = max(1, v.size // ROWS)
     v, around = v[::stride], round(WINDOW * stage.rate / stride)
