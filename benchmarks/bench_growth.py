@@ -20,6 +20,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from collections.abc import Callable, Sequence
 import contextlib
+from dataclasses import replace
 import io
 import json
 from pathlib import Path
@@ -28,6 +29,8 @@ import sys
 import tempfile
 import time
 
+from bench_inverse import EFFECTS as INVERTED
+from bench_inverse import motion
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import main as piezo_ident
@@ -200,6 +203,14 @@ def diagnose(size: float, folder: Path) -> tuple[float, int]:
     return clocked(lambda: pi.diagnose(model, record)), record.n
 
 
+def inverse(size: float, folder: Path) -> tuple[float, int]:
+    """Invert a motion of a model with amplifier lag, creep and a bent sensor."""
+    model = replace(paper(), effects=INVERTED)
+    y = motion(model, round(size * RATE))
+    model.inverse(motion(model, 20_000))
+    return clocked(lambda: model.inverse(y)), y.size
+
+
 BAGS = (10, 60, 600, HOUR)
 #: of each measure its title, lengths [s], and those of a quick run
 PLANS = {
@@ -209,6 +220,7 @@ PLANS = {
     read: ('bag read', BAGS, (10, 60)),
     convert: ('bag converted to npz', BAGS, (10,)),
     predict_bag: ('bag predicted to npz', BAGS, (10, 60)),
+    inverse: ('inversion', (1, 4, 16, 64), (1, 4, 16)),
     identify: ('identification', (15.5, 31, 62, 124, HOUR), (15.5,)),
     diagnose: (f'diagnosis, {len(catalogue())} candidates', (15, 30, 60, 120), (17,)),
 }
