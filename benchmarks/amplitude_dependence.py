@@ -35,13 +35,7 @@ class AmplitudeDependence:
     """
     Modes by group.
 
-    Attributes
-    ----------
-    groups : tuple of str
-    voltage : ndarray, shape (groups,)
-        rms of the voltages.
-    frequency, damping : ndarray, shape (groups, modes)
-        In Hz, and as a ratio.
+    `voltage`: rms of the voltages; `frequency`, `damping`: in Hz, and as a ratio.
     """
 
     groups: tuple[str, ...]
@@ -54,10 +48,7 @@ def amplitude_dependence(start: Modal, records: Sequence[PeriodicRecord]) -> Amp
     """
     Follow the strongest modes of a model that stand alone through the groups of records.
 
-    Parameters
-    ----------
-    start : Modal
-        A model of any of the groups.
+    `start`: A model of any of the groups.
     """
     parts = groups(records)
     rate = records[0].rate

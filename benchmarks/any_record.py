@@ -31,12 +31,14 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from scipy.optimize import least_squares, nnls
 from scipy.signal import butter, chirp, lfilter, sosfiltfilt
+from side_by_side import markdown
 from study_rows import write_cases
 from truths import FamilyStage
 from truths.families import make_core
 from truths.linear import make_linear
 
 Array = NDArray[np.float64]
+Pairs = list[tuple[Array, Array]]
 
 RATE = 10_000.0
 SECONDS = 6.0
@@ -127,8 +129,8 @@ class Case:
 
     stage: FamilyStage
     kind: str
-    fit: list[tuple[Array, Array]]
-    judge: list[tuple[Array, Array]]
+    fit: Pairs
+    judge: Pairs
 
 
 def draw(law: str, kind: str, seed: int, seconds: float = SECONDS) -> Case:
@@ -139,7 +141,7 @@ def draw(law: str, kind: str, seed: int, seconds: float = SECONDS) -> Case:
     stage = FamilyStage(core, linear, RATE, (0.0, 100.0), 50e-6, 1e-6, 'white', noise, seed=seed)
     own = np.random.default_rng([4712, seed, *law.encode(), *kind.encode()])
 
-    def records(name: str) -> list[tuple[Array, Array]]:
+    def records(name: str) -> Pairs:
         return [
             (100.0 * u, stage.respond(100.0 * u, f'{name} {i}'))
             for i, u in enumerate(motion(kind, own, seconds))
@@ -151,7 +153,7 @@ def draw(law: str, kind: str, seed: int, seconds: float = SECONDS) -> Case:
 # --- the peers: each takes records to fit, returns a function from voltage to displacement -----
 
 
-def line(records: list[tuple[Array, Array]]):
+def line(records: Pairs):
     """Fit a straight line."""
     v, y = (np.concatenate(x) for x in zip(*records, strict=True))
     p = np.polyfit(v, y, 1)
@@ -168,7 +170,7 @@ def _plays(v: Array, high: float) -> Array:
     return out
 
 
-def plays(records: list[tuple[Array, Array]]):
+def plays(records: Pairs):
     """Fit forty plays by non-negative least squares."""
     high = max(v.max() for v, _ in records)
     X, y = np.vstack([_plays(v, high) for v, _ in records]), np.hstack([y for _, y in records])
@@ -184,21 +186,17 @@ def _oe(theta: Array, n: int, w: Array) -> Array:
     return zi + lfilter(b, a, w - w[0]) + theta[-1]
 
 
-def _fit_oe(pairs: list[tuple[Array, Array]], n: int = 4):
+def _fit_oe(pairs: Pairs, n: int = 4):
     """Return the best linear output error over delays, from least squares, by Gauss-Newton."""
     best = None
     for m in (2, n):
         for d in range(8):
-            rows, right = [], []
+            rows, right, s = [], [], d + m + 2
             for w, y in pairs:
                 w, y = w - w.mean(), y - y.mean()
-                s = d + m + 2
-                rows.append(
-                    np.column_stack(
-                        [-y[s - i : -i] for i in range(1, m + 1)]
-                        + [w[s - d - j : w.size - d - j] for j in range(m + 1)]
-                    )
-                )
+                past = [-y[s - i : -i] for i in range(1, m + 1)]
+                past += [w[s - d - j : w.size - d - j] for j in range(m + 1)]
+                rows.append(np.column_stack(past))
                 right.append(y[s:])
             theta = np.linalg.lstsq(np.vstack(rows), np.hstack(right), rcond=None)[0]
             a, b = np.concatenate([[1.0], theta[:m]]), theta[m:]
@@ -225,14 +223,14 @@ def _fit_oe(pairs: list[tuple[Array, Array]], n: int = 4):
     return m, full
 
 
-def linear(records: list[tuple[Array, Array]]):
+def linear(records: Pairs):
     """Fit linear output error of order 2 or 4 with delays of 0 to 7 samples."""
     scale = np.ptp(records[0][1])
     m, theta = _fit_oe([(v / 100, y / scale) for v, y in records])
     return lambda v: scale * _oe(theta, m, v / 100)
 
 
-def plays_then_linear(records: list[tuple[Array, Array]]):
+def plays_then_linear(records: Pairs):
     """Fit plays, then output error behind them."""
     scale, h = np.ptp(records[0][1]), plays(records)
     m, theta = _fit_oe([(h(v) / scale, y / scale) for v, y in records])
@@ -242,25 +240,18 @@ def plays_then_linear(records: list[tuple[Array, Array]]):
 PEERS = (line, plays, linear, plays_then_linear)
 
 
-def percent(predict, records: list[tuple[Array, Array]]) -> float:
+def percent(predict, records: Pairs) -> float:
     """Return rms(y - y_hat) / (max y - min y) over all records, mean included [%]."""
     e = np.hstack([y - predict(v) for v, y in records])
     y = np.hstack([y for _, y in records])
     return 100.0 * float(np.sqrt(np.mean(e**2)) / np.ptp(y))
 
 
-def _records(records: list[tuple[Array, Array]]) -> list[pi.Record]:
-    return [
-        pi.Record.from_arrays(v, y, sample_rate=RATE, name=f'record {i}')
-        for i, (v, y) in enumerate(records)
-    ]
-
-
-def program(
-    records: list[tuple[Array, Array]], settings: pi.Settings | None = None
-) -> pi.StageModel:
+def program(records: Pairs, settings: pi.Settings | None = None) -> pi.StageModel:
     """Identify a model as a user does: no labels, and of the study no settings."""
-    return pi.identify(_records(records), settings).model
+    read = pi.Record.from_arrays
+    named = [read(*r, sample_rate=RATE, name=f'record {i}') for i, r in enumerate(records)]
+    return pi.identify(named, settings).model
 
 
 def slow_motion(model: pi.StageModel, rng: np.random.Generator) -> Array:
@@ -355,72 +346,68 @@ def springs(seed: int) -> list[tuple[str, float, float, float]]:
     ]
 
 
-CASE_HEADS = 'motion, hysteresis, seed, identify, best peer'
+TEXT = """\
+# Any record
+
+This page tells whoever has a record without labels how much a model errs that was
+identified from it, or from a pair, beside four peers of twenty lines each. The
+simulated stages have another hysteresis than the model, two or three light modes and a
+delay of any part of a sample. A record has 6 s at 10 kHz, noise of 0.005 to 0.05 % of
+stroke. The error is 100 rms(y - y_hat) / (max y - min y) in free run, mean included, on
+another realisation of the same kind of motion. `make any-record` writes this page (seeds
+{seeds}).
+
+Of {cases} cases {good} err at most 1.05 times as much as the best peer; the median is {median:.2f}
+times, the worst {worst:.2f}. An identification took {seconds:.1f} s of processor time (median).
+
+Median errors of all kinds of motion, % of stroke:
+
+{laws}
+
+{link}
+
+The peers are a straight line, forty plays by non-negative least squares, linear output
+error of order 2 or 4 with delays of 0 to 7 samples, and plays with such an output error
+behind them.
+
+## Inverse
+
+For a random motion slower than half the first mode, which begins and ends at rest, the
+drive has to be at most 1.2 times as wide, and its largest step 1.2 times as large, as
+without G; H has to rise.
+{faults}
+
+## Bouc-Wen benchmark
+
+A mass on a Bouc-Wen spring, from the equations of doi:10.4121/12967592: two periods of
+a multisine from rest are fitted, with the noise of the benchmark. The hysteresis is in
+the loop, and neither model has it there. Rms error [m]:
+
+{springs}
+"""
 
 
-def case_line(row: Row) -> list[object]:
-    """Return one case as a line of the CSV file."""
-    return [row.kind, row.law, row.seed, f'{row.own:.3g}', f'{min(row.peers):.3g}']
-
-
-def page(
-    rows: Sequence[Row], springs: Sequence[tuple[str, float, float, float]], cases: str
-) -> str:
+def page(rows: Sequence[Row], springs: Sequence[tuple[object, ...]], cases: str) -> str:
     """Return the page, in Markdown; `cases` is its link to the file of all cases."""
-    faults = [f'- {row.law}, {row.kind}: {row.fault}' for row in rows if row.fault]
     ratios = np.array([row.ratio for row in rows])
-    seeds = sorted({row.seed for row in rows})
-    lines = [
-        '# Any record',
-        '',
-        'This page tells whoever has a record without labels how much a model errs that was',
-        'identified from it, or from a pair, beside four peers of twenty lines each. The',
-        'simulated stages have another hysteresis than the model, two or three light modes and a',
-        'delay of any part of a sample. A record has 6 s at 10 kHz, noise of 0.005 to 0.05 % of',
-        'stroke. The error is 100 rms(y - y_hat) / (max y - min y) in free run, mean included, on',
-        'another realisation of the same kind of motion.',
-        f'`make any-record` writes this page (seed{"s" if len(seeds) > 1 else ""} '
-        f'{", ".join(map(str, seeds))}).',
-        '',
-        f'Of {len(rows)} cases {np.sum(ratios <= 1.05)} err at most 1.05 times as much as the',
-        f'best peer; the median is {np.median(ratios):.2f} times, the worst {ratios.max():.2f}.',
-        f'An identification took {np.median([row.seconds for row in rows]):.1f} s of processor',
-        'time (median).',
-        '',
-        'Median errors of all kinds of motion, % of stroke:',
-        '',
-        '| hysteresis of the stage | `identify` | best peer |',
-        '|---|---|---|',
-    ]
+    laws = []
     for law in dict.fromkeys(row.law for row in rows):
         pairs = [(row.own, min(row.peers)) for row in rows if row.law == law]
-        lines.append(f'| {law} | {" | ".join(f"{x:.3g}" for x in np.median(pairs, axis=0))} |')
-    lines += [
-        '',
-        cases,
-        '',
-        'The peers are a straight line, forty plays by non-negative least squares, linear output',
-        'error of order 2 or 4 with delays of 0 to 7 samples, and plays with such an output error',
-        'behind them.',
-        '',
-        '## Inverse',
-        '',
-        'For a random motion slower than half the first mode, which begins and ends at rest, the',
-        'drive has to be at most 1.2 times as wide, and its largest step 1.2 times as large, as',
-        'without G; H has to rise.',
-        *(faults or ['All models do.']),
-        '',
-        '## Bouc-Wen benchmark',
-        '',
-        'A mass on a Bouc-Wen spring, from the equations of doi:10.4121/12967592: two periods of',
-        'a multisine from rest are fitted, with the noise of the benchmark. The hysteresis is in',
-        'the loop, and neither model has it there. Rms error [m]:',
-        '',
-        '| judged on | rms of y | `identify` | linear output error |',
-        '|---|---|---|---|',
-        *(f'| {name} | {y:.3g} | {own:.3g} | {peer:.3g} |' for name, y, own, peer in springs),
-    ]
-    return '\n'.join(lines) + '\n'
+        laws.append([law, *(f'{x:.3g}' for x in np.median(pairs, axis=0))])
+    faults = [f'- {row.law}, {row.kind}: {row.fault}' for row in rows if row.fault]
+    judged = [[name, *(f'{x:.3g}' for x in errors)] for name, *errors in springs]
+    return TEXT.format(
+        seeds=', '.join(map(str, sorted({row.seed for row in rows}))),
+        cases=len(rows),
+        good=np.sum(ratios <= 1.05),
+        median=np.median(ratios),
+        worst=ratios.max(),
+        seconds=np.median([row.seconds for row in rows]),
+        laws=markdown(['hysteresis of the stage', '`identify`', 'best peer'], laws),
+        link=cases,
+        faults='\n'.join(faults or ['All models do.']),
+        springs=markdown(['judged on', 'rms of y', '`identify`', 'linear output error'], judged),
+    )
 
 
 def main() -> None:
@@ -443,8 +430,10 @@ def main() -> None:
                 flush=True,
             )
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    cases_link = write_cases(given.out, CASE_HEADS, map(case_line, rows))
-    given.out.write_text(page(rows, springs(given.seeds[0]), cases_link), encoding='utf-8')
+    heads = 'motion, hysteresis, seed, identify, best peer'
+    lines = ([r.kind, r.law, r.seed, f'{r.own:.3g}', f'{min(r.peers):.3g}'] for r in rows)
+    link = write_cases(given.out, heads, lines)
+    given.out.write_text(page(rows, springs(given.seeds[0]), link), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -30,22 +30,18 @@ from side_by_side import markdown, ratio, show, take_turns
 RUNS = 9
 LOOPS = """
 #include "NAME.h"
-void predict_NAME(const double *x, double *out, long n)
-{
-    static NAME_state s;
-    long k;
-    NAME_reset(&s, x[0]);
-    for (k = 0; k < n; k++)
-        out[k] = NAME_step(&s, x[k]);
-}
-void drive_NAME(const double *x, double *out, long n)
-{
-    static NAME_feedforward f;
-    long k;
-    NAME_feedforward_reset(&f, x[0]);
-    for (k = 0; k < n; k++)
-        out[k] = NAME_feedforward_step(&f, x[k]);
-}
+#define LOOP(function, state, reset, step) \\
+    void function(const double *x, double *out, long n) \\
+    { \\
+        static state s; \\
+        long k; \\
+        reset(&s, x[0]); \\
+        for (k = 0; k < n; k++) \\
+            out[k] = step(&s, x[k]); \\
+    }
+LOOP(predict_NAME, NAME_state, NAME_reset, NAME_step)
+LOOP(drive_NAME, NAME_feedforward, NAME_feedforward_reset, NAME_feedforward_step)
+#undef LOOP
 """
 #: shipped stages by the names of their headers
 STAGES = {'paper': "the paper's stage", 'effects': 'the same with creep and rate dependence'}
@@ -88,12 +84,10 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
             y = model.simulate(v)
             works = {f'{what}: `model.simulate`': lambda _, m=model: m.simulate(v)}
             for level, loops in made.items():
-                works[f'{what}: `{name}_step`, `{level}`'] = caller(
-                    loops, f'predict_{name}', v, out
-                )
-            works[f'{what}: `{name}_feedforward_step`, `-O2`'] = caller(
-                made['-O2'], f'drive_{name}', y[: n // 10].copy(), np.empty(n)
-            )
+                step = caller(loops, f'predict_{name}', v, out)
+                works[f'{what}: `{name}_step`, `{level}`'] = step
+            drive = caller(made['-O2'], f'drive_{name}', y[: n // 10].copy(), np.empty(n))
+            works[f'{what}: `{name}_feedforward_step`, `-O2`'] = drive
             turns = take_turns(works, runs, warm=works)
             base = next(iter(turns.values()))
             for key, turn in turns.items():
@@ -101,14 +95,9 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
                 share = ratio(turn.over(base) * n / size)
                 rows.append([key, f'{1e9 * turn.median / size:.3g}', share])
             gaps.append(float(np.abs(out - y).max() / np.ptp(y)))
-    head = ('', 'ns a sample', 'times `model.simulate`')
-    return [
-        (
-            'The exported C header',
-            f'{markdown(head, rows)}\n\nLargest difference of the predictions: {max(gaps):.1e} '
-            'of stroke.',
-        )
-    ]
+    table = markdown(('', 'ns a sample', 'times `model.simulate`'), rows)
+    gap = f'Largest difference of the predictions: {max(gaps):.1e} of stroke.'
+    return [('The exported C header', f'{table}\n\n{gap}')]
 
 
 if __name__ == '__main__':

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Inversion of a motion, for each law of H and with effects, and its growth with the motion.
+Inversion of a motion, for each law of H and with effects.
 
     .venv-bench/bin/python benchmarks/bench_inverse.py [--quick]
 
@@ -23,7 +23,7 @@ import piezo_ident as pi
 from piezo_ident.common.arrays import Array
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
-from side_by_side import markdown, ratio, seconds, show, take_turns
+from side_by_side import markdown, ratio, show, take_turns
 
 RATE = 20_000.0
 #: plays of each law, and what they add together beside a line of slope 1
@@ -77,71 +77,27 @@ def of_models(n: int, runs: int) -> str:
     for name, model in models().items():
         y = motion(model, n)
         v = model.inverse(y).v
-        turns = take_turns(
-            {
-                'inverse': lambda k, m=model, y=y: m.inverse(y),
-                'prediction': lambda k, m=model, v=v: m.simulate(v),
-            },
-            runs,
-        )
-        inverse, prediction = turns['inverse'], turns['prediction']
+        works = {
+            'inverse': lambda k, m=model, y=y: m.inverse(y),
+            'prediction': lambda k, m=model, v=v: m.simulate(v),
+        }
+        inverse, prediction = take_turns(works, runs).values()
         drive = inverse.results[0]
-        rows.append(
-            [
-                name,
-                f'{1e9 * inverse.median / n:.0f}',
-                ratio(n / RATE / inverse.median),
-                ratio(inverse.over(prediction)),
-                drive.passes,
-                f'{drive.error:.2g}',
-            ]
-        )
+        times = (ratio(n / RATE / inverse.median), ratio(inverse.over(prediction)))
+        a_sample = f'{1e9 * inverse.median / n:.0f}'
+        rows.append([name, a_sample, *times, drive.passes, f'{drive.error:.2g}'])
     heads = ['model', 'ns a sample', 'times faster than real time', 'times a prediction']
     return markdown([*heads, 'passes', 'left, % of stroke'], rows)
-
-
-def of_length(lengths: list[int], runs: int) -> str:
-    """Return a table over the length of the motion, with the exponent."""
-    model = replace(pi.SimulatedStage.load('paper').model, effects=EFFECTS)
-    motions = {n: motion(model, n) for n in lengths}
-    turns = take_turns(
-        {str(n): lambda k, y=y: model.inverse(y) for n, y in motions.items()},
-        runs,
-        warm=(str(lengths[0]),),
-    )
-    # a pass more or less is no growth
-    times = [turns[str(n)].median for n in lengths]
-    a_pass = [t / turns[str(n)].results[0].passes for t, n in zip(times, lengths, strict=True)]
-    exponent = np.polyfit(np.log(lengths), np.log(a_pass), 1)[0]
-    rows = [
-        [
-            f'{n / RATE:g} s',
-            f'{n:,}',
-            seconds(t),
-            ratio(n / RATE / t),
-            turns[str(n)].results[0].passes,
-        ]
-        for n, t in zip(lengths, times, strict=True)
-    ]
-    heads = ['motion', 'samples', 'time', 'times faster than real time', 'passes']
-    return f'{markdown(heads, rows)}\n\nExponent of the time of a pass: {exponent:.2f}.'
 
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
     n, runs = (100_000, 3) if quick else (400_000, 7)
-    lengths = [20_000, 80_000, 320_000] if quick else [20_000, 80_000, 320_000, 1_280_000]
     about = (
         f'A raster of {n / RATE:g} s at 20 kHz, all offline: filter, passes and checks. The error '
         'is what the inversion leaves of the model itself.'
     )
-    return [
-        ('Inversion of a motion', f'{about}\n\n{of_models(n, runs)}'),
-        (
-            'Inversion: growth with the motion',
-            f'With amplifier lag, creep and a bent sensor.\n\n{of_length(lengths, runs)}',
-        ),
-    ]
+    return [('Inversion of a motion', f'{about}\n\n{of_models(n, runs)}')]
 
 
 if __name__ == '__main__':

@@ -100,15 +100,7 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     """
     Return the section of this benchmark.
 
-    Parameters
-    ----------
-    quick : bool, optional
-        A few records, once.
-
-    Raises
-    ------
-    RuntimeError
-        When the tables differ: then nothing else is worth saying.
+    `quick`: A few records, once.
     """
     runs, n = (1, 12) if quick else (RUNS, RECORDS)
     cores = len(os.sched_getaffinity(0))

@@ -79,13 +79,7 @@ class Narx:
     """
     A polynomial NARX model, its terms chosen by FROLS.
 
-    Attributes
-    ----------
-    rate : int
-        Samples that are averaged.
-    inputs : str
-        'v', or with its speed 'v, dv'.
-    degree, lag, terms : int
+    `rate`: samples that are averaged; `inputs`: 'v', or with its speed 'v, dv'.
     """
 
     rate: int
@@ -157,15 +151,8 @@ class Sindy:
     """
     dy/dt = dv/dt P(y, v) + |dv/dt| Q(y, v) with sparse polynomials, which knows no rate.
 
-    Attributes
-    ----------
-    rate : int
-        Samples that are averaged.
-    degree : int
-    threshold, alpha : float
-        Of the sequentially thresholded least squares.
-    window : int
-        Samples over which the derivative is smoothed.
+    `rate`: samples that are averaged; `threshold`, `alpha`: of the sequentially thresholded least
+    squares; `window`: samples over which the derivative is smoothed.
     """
 
     rate: int

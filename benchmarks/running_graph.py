@@ -69,14 +69,8 @@ class RunningGraph:
     """
     Excitation, stage, identifier, model and recorder, each a process of its own.
 
-    Parameters
-    ----------
-    folder : path
-        For the recording, ``bag``, and the logs.
-    take : callable
-        Given each block that is observed: topic, receipt [ns], number of its first sample, size.
-    parameters : mapping of str to mapping, optional
-        Of the nodes.
+    `folder`: for the recording, ``bag``, and the logs; `take`: given each block that is observed:
+    topic, receipt [ns], number of its first sample, size; `parameters`: of the nodes.
     """
 
     def __init__(

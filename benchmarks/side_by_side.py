@@ -37,12 +37,7 @@ class Turn:
     """
     What came of one work over its turns.
 
-    Attributes
-    ----------
-    times : list of float
-        Wall time of each turn [s].
-    results : list
-        What each turn returned.
+    `times`: wall time of each turn [s]; `results`: what each turn returned.
     """
 
     times: list[float] = field(default_factory=list)
@@ -65,13 +60,8 @@ def take_turns(
     """
     Run every work in turns.
 
-    Parameters
-    ----------
-    works : mapping of str to callable
-        Each is given the number of the turn.
-    runs : int
-    warm : iterable of str, optional
-        Works that are run once before, untimed: what compiles on its first call.
+    `works`: each is given the number of the turn; `warm`: works that are run once before, untimed:
+    what compiles on its first call.
     """
     for name in warm:
         works[name](0)
@@ -99,14 +89,7 @@ def ratio(x: float) -> str:
 
 
 def last_line(what: str, command: Sequence[str]) -> str:
-    """
-    Run a program, whose memory is its own, and return the last line that it prints.
-
-    Raises
-    ------
-    RuntimeError
-        When it fails, with the last line of what it said.
-    """
+    """Run a program, whose memory is its own, and return the last line that it prints."""
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         said = done.stderr.strip().splitlines() or [f'exit code {done.returncode}']

@@ -23,7 +23,6 @@ import platform
 import sys
 
 import numpy as np
-from piezo_ident import __version__
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
@@ -33,7 +32,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
-import scipy
+from side_by_side import markdown, versions
 from tqdm import tqdm
 
 SEEDS = 20
@@ -52,14 +51,11 @@ def minor_loop_error(model: StageModel, truth: Record) -> float:
     return percent_of_stroke(y, free_run(model, truth).predicted)
 
 
-def seeds_table(stage: SimulatedStage) -> list[str]:
+def seeds_table(stage: SimulatedStage) -> str:
     """Run all seeds and noise levels on the stage whose thresholds are the model's own."""
     truth = record_of(stage.ideal, 'validation')
-    lines = [
-        '| noise / stroke | runs | d right | stable | swarm within 1 % | worst error, % of stroke '
-        '| allowed | median error |',
-        '|---|---|---|---|---|---|---|---|',
-    ]
+    heads = 'noise / stroke, runs, d right, stable, swarm within 1 %, worst error in % of stroke'
+    lines = []
     for noise in NOISES:
         # a share of the stroke
         rms = noise * abs(stage.model.scaling.Y)
@@ -74,22 +70,15 @@ def seeds_table(stage: SimulatedStage) -> list[str]:
         stable = sum(r.model.dynamics.is_stable for r, _ in found)
         excess = [(r.hysteresis.swarm_loss or 0) / r.hysteresis.optimum_loss - 1 for r, _ in found]
         worst = [w for _, w in found]
-        lines.append(
-            f'| {noise:g} | {SEEDS} | {d_right} | {stable} | {sum(e < 0.01 for e in excess)} '
-            f'| {max(worst):.4f} | {max(0.02, 200 * noise):.3g} | {np.median(worst):.4f} |'
-        )
-    return lines
+        near = sum(e < 0.01 for e in excess)
+        errors = (f'{max(worst):.4f}', f'{max(0.02, 200 * noise):.3g}', f'{np.median(worst):.4f}')
+        lines.append([f'{noise:g}', SEEDS, d_right, stable, near, *errors])
+    return markdown([*heads.split(', '), 'allowed', 'median error'], lines)
 
 
-def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
+def thresholds_table(stages: dict[str, SimulatedStage]) -> str:
     """Compare ten with chosen thresholds on both stages."""
-    frequencies = (1, 10, 50, 80, 100, 120)
-    lines = [
-        '| stage | thresholds | '
-        + ' | '.join(f'{f} Hz' for f in frequencies)
-        + ' | minor loops |',
-        '|---|---|' + '---|' * (len(frequencies) + 1),
-    ]
+    frequencies, lines = (1, 10, 50, 80, 100, 120), []
     for name, stage in stages.items():
         record = record_of(stage, 'identification')
         sines, loops = (record_of(stage.ideal, x) for x in ('validation', 'minor_loops'))
@@ -102,44 +91,51 @@ def thresholds_table(stages: dict[str, SimulatedStage]) -> list[str]:
                 rows[0] = (f'chosen: {rows[0][0]}', model)
             for label, m in rows:
                 errors = {round(e.frequency): e.percent for e in sine_errors(m, sines)}
-                cells = ' | '.join(f'{errors[f]:.4f}' for f in frequencies)
-                lines.append(f'| {name} | {label} | {cells} | {minor_loop_error(m, loops):.4f} |')
-    return lines
+                shown = (*(errors[f] for f in frequencies), minor_loop_error(m, loops))
+                lines.append([name, label, *(f'{x:.4f}' for x in shown)])
+    heads = ['stage', 'thresholds', *(f'{f} Hz' for f in frequencies), 'minor loops']
+    return markdown(heads, lines)
+
+
+TEXT = """\
+# How well simulated stages are identified
+
+This page shows how near the three steps come to known stages. It was made by
+`make study-identification`. Errors are free-run errors against the noise-free stage,
+100 rms(y - y_hat) / (max y - min y), on motions that were not fitted: the sines
+v = 5 + 5 sin(2 pi f t) in steady state, and minor loops at three biases with a decaying
+triangle.
+
+Python {python}, {versions}
+
+## Twenty seeds and three noise levels, the paper's stage
+
+The flattering case: the truth lies on the model's own thresholds. 16-bit converters.
+"Worst error" is the largest over the six sines and all seeds. "Swarm" counts the seeds
+whose loss was within 1 % of bounded least squares. The swarm made the models.
+
+{seeds}
+
+## On and off the grid, noise {noise:g} of stroke
+
+The second stage has 40 thresholds that are none of the model's. % of stroke.
+
+{thresholds}
+"""
 
 
 def main() -> None:
     """Write the study to the file named on the command line."""
-    target = Path(sys.argv[1])
     paper, dense = (SimulatedStage.load(name) for name in ('paper', 'dense'))
-    noise = paper.sensor.noise_rms / abs(paper.model.scaling.Y)
-    text = [
-        '# How well simulated stages are identified',
-        '',
-        'This page shows how near the three steps come to known stages. It was made by',
-        '`make study-identification`. Errors are free-run errors against the noise-free stage,',
-        '100 rms(y - y_hat) / (max y - min y), on motions that were not fitted: the sines',
-        'v = 5 + 5 sin(2 pi f t) in steady state, and minor loops at three biases with a decaying',
-        'triangle.',
-        '',
-        f'piezo_ident {__version__}, Python {platform.python_version()}, '
-        f'numpy {np.__version__}, scipy {scipy.__version__}',
-        '',
-        "## Twenty seeds and three noise levels, the paper's stage",
-        '',
-        "The flattering case: the truth lies on the model's own thresholds. 16-bit converters.",
-        '"Worst error" is the largest over the six sines and all seeds. "Swarm" counts the seeds',
-        'whose loss was within 1 % of bounded least squares. The swarm made the models.',
-        '',
-        *seeds_table(paper),
-        '',
-        f'## On and off the grid, noise {noise:g} of stroke',
-        '',
-        "The second stage has 40 thresholds that are none of the model's. % of stroke.",
-        '',
-        *thresholds_table({'paper (flattering)': paper, '40 thresholds off the grid': dense}),
-        '',
-    ]
-    target.write_text('\n'.join(text), encoding='utf-8')
+    stages = {'paper (flattering)': paper, '40 thresholds off the grid': dense}
+    text = TEXT.format(
+        python=platform.python_version(),
+        versions=versions('piezo_ident', 'numpy', 'scipy'),
+        seeds=seeds_table(paper),
+        noise=paper.sensor.noise_rms / abs(paper.model.scaling.Y),
+        thresholds=thresholds_table(stages),
+    )
+    Path(sys.argv[1]).write_text(text, encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -58,22 +58,11 @@ class Records:
     """
     What a case hands over, and what is true of it.
 
-    Attributes
-    ----------
-    identification, diagnosis, unseen : Record
-    truth : dict of str to float
-        Every hidden effect and its size on the diagnosis record: the rms of what it changes
-        behind offset and gain, % of stroke.
-    left : dict of str to float
-        What a refit of forty plays leaves of each, % of stroke.
-    fault : str
-    misfit : float
-        Error of forty plays with the true linear part, fitted on the identification, of the stage
-        without its effects, on the unseen record, % of stroke.
-    unseen_forms : dict of str to float
-        Error on the unseen record of each form of the hysteresis, likewise.
-    stage : FamilyStage
-        With the effects in it.
+    `truth`: every hidden effect and its size on the diagnosis record: the rms of what it changes
+    behind offset and gain, % of stroke; `left`: what a refit of forty plays leaves of each, % of
+    stroke; `misfit`: error of forty plays with the true linear part, fitted on the identification,
+    of the stage without its effects, on the unseen record, % of stroke; `unseen_forms`: error on
+    the unseen record of each form of the hysteresis, likewise; `stage`: with the effects in it.
     """
 
     identification: Record
@@ -174,12 +163,8 @@ def case_records(case: Case, forms: bool = True) -> Records:
     """
     Return the records of a case, and the truth.
 
-    Parameters
-    ----------
-    case : Case
-        Of `truths.draw`.
-    forms : bool
-        Also compare forms of the hysteresis, which takes some seconds.
+    `case`: of `truths.draw`; `forms`: also compare forms of the hysteresis, which takes some
+    seconds.
     """
     stage = make_family_stage(case.core, case.seed, case.effects, further=case.group != 'tuning')
     low, high = stage.limits

@@ -97,13 +97,8 @@ def dots_and_ranges(
     """
     Draw errors on a logarithmic axis, a line for each key: medians as dots, ranges as bars.
 
-    Parameters
-    ----------
-    errors : mapping of str to sequence of sequence of float
-        For each line its cases, each with an error for every head.
-    heads : sequence of str
-    label : str
-        Name and unit of the errors.
+    `errors`: for each line its cases, each with an error for every head; `label`: name and unit of
+    the errors.
     """
     fig = style.figure(0.8 + (0.2 + 0.08 * len(heads)) * len(errors))
     axes = fig.subplots()

@@ -33,6 +33,7 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
+from side_by_side import markdown
 from truths import table_one_sines
 from truths.table_one import PUBLISHED, table_one_stage
 
@@ -50,13 +51,7 @@ segments:
   - {signal: sine, name: 140Hz-small, bias: 5, amplitude: 1.5, frequency: 140, periods: 100}
   - {signal: staircase, levels: [0, 5, 10, 5, 0], hold: [0.5, 1.5, 2.5, 1.5, 1]}
   - {signal: minor_loops, biases: [2.5, 5, 7.5], amplitude: 1.5, cycles: 2, slope: 24}
-  - signal: multisine
-    bias: 5
-    amplitude: 4.5
-    lowest: 1
-    highest: 200
-    period: 1
-    periods: 2
+  - {signal: multisine, bias: 5, amplitude: 4.5, lowest: 1, highest: 200, period: 1, periods: 2}
   - {signal: idle, duration: 0.5}
 """
 OTHER = """
@@ -71,6 +66,24 @@ segments:
   - {signal: hold, level: 7, duration: 5}
   - {signal: hold, level: 2, duration: 5}
   - {signal: idle, duration: 0.3}
+"""
+
+
+TEXT = """\
+# Table I, with a third row
+
+This page adds to Table I of the paper what a diagnosis gains. `make table-one` made it. Errors are
+free-run errors, rms(y - y_hat) / (max y - min y) in %, of v = 5 + 5 sin(2 pi f t) in steady state.
+The simulated stage has rate dependence and creep, by other laws than the candidates
+(`benchmarks/truths/table_one.py`).
+
+{sines}
+
+> {sentence}
+
+Segments that neither step saw, in % of the stroke of their record:
+
+{others}
 """
 
 
@@ -113,30 +126,20 @@ def main() -> None:
     other = parse_program(OTHER).build(sample_rate=RATE)
     held = record_of(other.v, other.segments, 'other', 4)
     others = [by_segment(m, held) for m in (model, result.model)]
-    text = [
-        '# Table I, with a third row',
-        '',
-        'This page adds to Table I of the paper what a diagnosis gains. `make table-one` made it. '
-        'Errors are free-run errors, rms(y - y_hat) / (max y - min y) in %, of '
-        'v = 5 + 5 sin(2 pi f t) in steady state. The simulated stage has rate dependence and '
-        'creep, by other laws than the candidates (`benchmarks/truths/table_one.py`).',
-        '',
-        f'| | {" | ".join(f"{f} Hz" for f in PUBLISHED)} |',
-        f'|---|{"---|" * len(PUBLISHED)}',
-        f'| Table I, measured stage | {" | ".join(f"{x:.2f}" for x in PUBLISHED.values())} |',
-        f'| this stage, three steps | {" | ".join(f"{before[f]:.2f}" for f in PUBLISHED)} |',
-        f'| after the diagnosis | {" | ".join(f"{after[f]:.2f}" for f in PUBLISHED)} |',
-        '',
-        f'> {result.sentence}',
-        '',
-        'Segments that neither step saw, in % of the stroke of their record:',
-        '',
-        '| segment | three steps | after the diagnosis |',
-        '|---|---|---|',
-    ]
-    text += [f'| {k} | {others[0][k]:.3f} | {others[1][k]:.3f} |' for k in others[0]]
-    out.write_text('\n'.join(text) + '\n', encoding='utf-8')
-    sys.stdout.write('\n'.join(text) + '\n')
+    lines = {
+        'Table I, measured stage': PUBLISHED,
+        'this stage, three steps': before,
+        'after the diagnosis': after,
+    }
+    rows = [[name, *(f'{errors[f]:.2f}' for f in PUBLISHED)] for name, errors in lines.items()]
+    segments = [[k, *(f'{errors[k]:.3f}' for errors in others)] for k in others[0]]
+    text = TEXT.format(
+        sines=markdown(['', *(f'{f} Hz' for f in PUBLISHED)], rows),
+        sentence=result.sentence,
+        others=markdown(['segment', 'three steps', 'after the diagnosis'], segments),
+    )
+    out.write_text(text, encoding='utf-8')
+    sys.stdout.write(text)
 
 
 if __name__ == '__main__':

@@ -57,10 +57,7 @@ def odd_messages(large: int = 5_000_000) -> Iterator[tuple[str, Any]]:
     """
     Yield what is sent, by name: messages that are no blocks, or bytes that are no message.
 
-    Parameters
-    ----------
-    large : int
-        Samples of the largest one.
+    `large`: samples of the largest one.
     """
     from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 
@@ -209,12 +206,8 @@ class Attack:
     """
     An attack on a graph that runs.
 
-    Parameters
-    ----------
-    g : Graph
-        With the nodes of `NODES` that are attacked; see test/nodes/graph.py.
-    nodes : tuple of str
-        Those of them that run.
+    `g`: with the nodes of `NODES` that are attacked; see test/nodes/graph.py; `nodes`: those of
+    them that run.
     """
 
     def __init__(self, g: Any, nodes: tuple[str, ...] = NODES) -> None:

@@ -176,22 +176,10 @@ class Outcome:
     """
     What came of a run over two hosts.
 
-    Attributes
-    ----------
-    state, message : str
-        The identifier's last status.
-    sent, captured : int
-        Samples of the program, and those of both streams that the identifier got.
-    lost : int
-        Samples that the identifier says are missing, over all topics.
-    faults : tuple of str
-        What the report names.
-    model : str
-        YAML; empty when none was made.
-    dropped : int
-        Packets.
-    seconds : float
-        From the call to the end.
+    `state`, `message`: the identifier's last status; `sent`, `captured`: samples of the program,
+    and those of both streams that the identifier got; `lost`: samples that the identifier says are
+    missing, over all topics; `faults`: what the report names; `model`: YAML; empty when none was
+    made; `dropped`: packets; `seconds`: from the call to the end.
     """
 
     state: str
@@ -216,17 +204,8 @@ def run(percent: int = 0, down: float = 0.0) -> Outcome:
     """
     Run a program over two hosts.
 
-    Parameters
-    ----------
-    percent : int
-        Of the packets that are dropped, in both directions.
-    down : float
-        How long the link is down in the midst of it [s].
-
-    Raises
-    ------
-    RuntimeError
-        When the run does not come to an end, or a node ends.
+    `percent`: of the packets that are dropped, in both directions; `down`: how long the link is
+    down in the midst of it [s].
     """
     from piezo_ident.excitation.program import parse_program
 
@@ -318,10 +297,7 @@ def seen_from(discovery: str) -> dict[str, list[str]]:
     """
     Return which nodes each host sees while one stage runs on each of them.
 
-    Parameters
-    ----------
-    discovery : str
-        For ROS_AUTOMATIC_DISCOVERY_RANGE of who looks; empty for none.
+    `discovery`: for ROS_AUTOMATIC_DISCOVERY_RANGE of who looks; empty for none.
     """
     with Hosts(discovery) as hosts:
         if not discovery:

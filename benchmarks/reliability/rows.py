@@ -17,14 +17,8 @@ def write_rows(name: str, rows: Sequence[tuple[str, str, str]], command: str) ->
     """
     Write the rows of one study in place of those of an earlier run.
 
-    Parameters
-    ----------
-    name : str
-        Of the study.
-    rows : sequence of (str, str, str)
-        What was tried, how often, and what happened.
-    command : str
-        Does it again.
+    `name`: of the study; `rows`: what was tried, how often, and what happened; `command`: does it
+    again.
     """
     ROWS.mkdir(parents=True, exist_ok=True)
     data = [dict(zip(KEYS, (*row, command), strict=True)) for row in rows]

@@ -281,14 +281,7 @@ class Publishers:
 
 
 def sequence(seed: int) -> Counter[str]:
-    """
-    Play one sequence, and return what was met in it.
-
-    Raises
-    ------
-    Broken
-        When the property does not hold.
-    """
+    """Play one sequence, and return what was met in it."""
     rng = np.random.default_rng(seed)
     rate = float(rng.choice([1000.0, 20_000.0, 51_200.0]))
     start = _drawn_settings(rng, rate)

@@ -112,27 +112,12 @@ class Soak:
     """
     What a long run gave.
 
-    Attributes
-    ----------
-    seconds : float
-        Of program.
-    samples : int
-        Of the programs.
-    lost : dict of str to int
-        Samples that are missing, by stream at the observer, and by where the graph counts.
-    memory : dict of str to (first, last, slope, error)
-        MB, MB, MB/h and MB/h, after the first quarter.
-    drift : float
-        Of the sample clock against that of the machine [s/s], and what it is known to.
-    drift_error : float
-    late : int
-        Blocks that the excitation sent after the next was due.
-    slipped : float
-        By how much its schedule moved [s].
-    parts : int
-        Of the recording.
-    recorded : dict of str to int
-        Samples of each stream in all parts.
+    `seconds`: of program; `samples`: of the programs; `lost`: samples that are missing, by stream
+    at the observer, and by where the graph counts; `memory`: MB, MB, MB/h and MB/h, after the
+    first quarter; `drift`: of the sample clock against that of the machine [s/s], and what it is
+    known to; `late`: blocks that the excitation sent after the next was due; `slipped`: by how
+    much its schedule moved [s]; `parts`: of the recording; `recorded`: samples of each stream in
+    all parts.
     """
 
     seconds: float
@@ -161,18 +146,9 @@ def soak(seconds: float, factor: float, part: int, folder: Path, size: int = BLO
     """
     Run the graph.
 
-    Parameters
-    ----------
-    seconds : float
-        Length of all programs together.
-    factor : float
-        `rate_factor` of the excitation; 1 is real time.
-    part : int
-        Size of a part of the recording [bytes].
-    folder : path
-        For bags and logs.
-    size : int, optional
-        Samples in a block.
+    `seconds`: length of all programs together; `factor`: `rate_factor` of the excitation; 1 is
+    real time; `part`: size of a part of the recording [bytes]; `folder`: for bags and logs;
+    `size`: samples in a block.
     """
     data = yaml.safe_load(MODEL.read_text())
     model = folder / 'model.yaml'

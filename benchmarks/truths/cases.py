@@ -122,24 +122,10 @@ class Case:
     """
     A stage of another family, what is hidden in it, and how it is measured.
 
-    Attributes
-    ----------
-    group : str
-        One of `SETS`.
-    number : int
-    core : str
-    kind : {'none', 'one', 'pair', 'fault'}
-    effects : tuple of str
-    factors : tuple of float
-        Wanted size of each effect, in parts of the core's misfit.
-    fault : str
-        One of `FAULTS`, or nothing.
-    labelled : bool
-    poorer : str
-        What the diagnosis record lacks, or nothing.
-    idle_channel : bool
-        Whether another axis is recorded that does not couple.
-    seed : int
+    `group`: one of `SETS`; `kind`: {'none', 'one', 'pair', 'fault'}; `factors`: wanted size of
+    each effect, in parts of the core's misfit; `fault`: one of `FAULTS`, or nothing; `poorer`:
+    what the diagnosis record lacks, or nothing; `idle_channel`: whether another axis is recorded
+    that does not couple.
     """
 
     group: str
@@ -190,12 +176,7 @@ def draw(group: str, number: int) -> Case:
     """
     Return a case.
 
-    Parameters
-    ----------
-    group : str
-        One of `SETS`.
-    number : int
-        0 .. ``CASES[group] - 1``.
+    `group`: one of `SETS`; `number`: 0 .. ``CASES[group] - 1``.
     """
     decks = _decks(group)
     seed = 1000 * SETS[group][0] + number

@@ -68,10 +68,7 @@ class Density:
     """
     Density of play thresholds p(r), a sum of Erlang densities.
 
-    Attributes
-    ----------
-    amount, order, scale : ndarray, shape (m,)
-        Weight, shape number k (1 .. 3) and scale of each term.
+    `amount`, `order`, `scale`: weight, shape number k (1 .. 3) and scale of each term.
     """
 
     amount: Array
@@ -164,13 +161,8 @@ def everett(u: Array, density: Density, kappa: float = 0.0) -> Array:
     """
     Return the Preisach operator of a density, from the virgin state at u = 0.
 
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-    density : Density
-    kappa : float
-        The Everett function is g(a - b) (1 + kappa (a + b - 1)): the density of switches at
-        (a, b) then varies with a + b, and equal loops differ with their bias.
+    `kappa`: the Everett function is g(a - b) (1 + kappa (a + b - 1)): the density of switches at
+    (a, b) then varies with a + b, and equal loops differ with their bias.
     """
     out = np.empty(u.size)
     d = density
@@ -221,20 +213,11 @@ def plays(
     """
     Return a dense row of one-sided plays, from the virgin state at u = 0.
 
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-    density : Density or Row
-    low, high : ndarray, shape (n,), optional
-        How far the lower and the upper edge of every play move outwards, in parts of its width.
-    additive : bool
-        Those are parts of the span instead, the same for every play.
-    follow : float
-        Share of the way to its place that a play moves in one sample; 1 is a stiff play.
-    forget : float
-        Share of the way to the middle of its band that a play relaxes in one sample.
-    curve : float
-        k of the envelopes F + k ((exp(2 F) - 1) / (exp(2) - 1) - F): generalised plays.
+    `low`, `high`: how far the lower and the upper edge of every play move outwards, in parts of
+    its width; `additive`: those are parts of the span instead, the same for every play; `follow`:
+    share of the way to its place that a play moves in one sample; 1 is a stiff play; `forget`:
+    share of the way to the middle of its band that a play relaxes in one sample; `curve`: k of the
+    envelopes F + k ((exp(2 F) - 1) / (exp(2) - 1) - F): generalised plays.
     """
     r, q = density.row()
     still = np.zeros(u.size)

@@ -46,17 +46,9 @@ class Affected:
         """
         Return the displacement at times t, shape (n,), without the sensor's noise.
 
-        Parameters
-        ----------
-        t : ndarray, shape (n,)
-        u : ndarray, shape (m,)
-            Command, m >= n: what came before the record is at its beginning.
-        gains : mapping of str to float
-            Parameter of the law of every effect.
-        other : ndarray, shape (n,), or None
-            Command of another axis.
-        draw : callable
-            Returns the generator of an effect.
+        `u`: command, m >= n: what came before the record is at its beginning; `gains`: parameter
+        of the law of every effect; `other`: command of another axis; `draw`: returns the generator
+        of an effect.
         """
         kind, rate = self.variants, self.rate
 

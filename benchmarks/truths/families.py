@@ -74,10 +74,7 @@ def core_of(name: str, law: Law, width: float) -> Core | None:
     """
     Return the core with a loop so wide, or None where it would be no piezo's.
 
-    Parameters
-    ----------
-    width : float
-        Largest distance of the branches, in parts of the stroke.
+    `width`: largest distance of the branches, in parts of the stroke.
     """
     u, rise, fall = steady_loop(law)
     widest, reach = float(np.max(fall - rise)), float(rise[-1] - rise[0])

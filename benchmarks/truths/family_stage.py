@@ -30,24 +30,10 @@ class FamilyStage(Affected):
     """
     A stage that is measured.
 
-    Attributes
-    ----------
-    core : Core
-    linear : Linear
-    rate : float
-        [Hz]
-    limits : tuple of float
-        [V]
-    stroke : float
-        [m], negative where the sensor looks the other way.
-    offset : float
-        Reading at the lowest voltage [m].
-    noise : {'white', '1/f', '10-bit', '12-bit'}
-    noise_rms : float
-        Share of the stroke.
-    gains, variants : mapping of str to number
-        Parameter and form of the law of every effect.
-    seed : int
+    `rate`: [Hz]; `limits`: [V]; `stroke`: [m], negative where the sensor looks the other way;
+    `offset`: reading at the lowest voltage [m]; `noise`: {'white', '1/f', '10-bit', '12-bit'};
+    `noise_rms`: share of the stroke; `gains`, `variants`: parameter and form of the law of every
+    effect.
     """
 
     core: Core
@@ -87,19 +73,10 @@ class FamilyStage(Affected):
         """
         Return the displacement [m], shape (n,).
 
-        Parameters
-        ----------
-        v : ndarray, shape (n,)
-            Command held between samples [V].
-        name : {'identification', 'diagnosis', 'unseen'}
-            Of the record: its own noise, phases and past.  What is in `SETS_IN` sets in behind
-            the identification.
-        gains : mapping, optional
-            Instead of the stage's own.
-        other : ndarray, shape (n,), optional
-            Voltage of another axis [V].
-        clean : bool
-            Without the sensor's noise, in parts of the stroke and without offset.
+        `v`: command held between samples [V]; `name`: {'identification', 'diagnosis', 'unseen'}:
+        Of the record: its own noise, phases and past. What is in `SETS_IN` sets in behind the
+        identification; `gains`: instead of the stage's own; `other`: voltage of another axis [V];
+        `clean`: without the sensor's noise, in parts of the stroke and without offset.
         """
         gains = dict(self.gains if gains is None else gains)
         if name == 'identification':
@@ -184,15 +161,8 @@ def make_family_stage(
     """
     Draw a stage; the gains of its effects are still to be found.
 
-    Parameters
-    ----------
-    core : str
-        One of `families.LAWS`.
-    seed : int
-    effects : tuple of str
-        Of which the forms are drawn.
-    further : bool
-        Also draw from `FURTHER`, which counts twice.
+    `core`: one of `families.LAWS`; `effects`: of which the forms are drawn; `further`: also draw
+    from `FURTHER`, which counts twice.
     """
     rng = np.random.default_rng([8812, seed])
     rate = float(rng.choice([10_000.0, 20_000.0, 20_000.0, 50_000.0]))

@@ -23,15 +23,7 @@ def spoilt(y: Array, fault: str, rate: float, rng: Rng) -> Array:
     """
     Return readings with a fault.
 
-    Parameters
-    ----------
-    y : ndarray, shape (n,)
-        In parts of the stroke, as the sensor reads.
-    fault : str
-        One of `NAMES`.
-    rate : float
-        [Hz]
-    rng : numpy.random.Generator
+    `y`: in parts of the stroke, as the sensor reads; `fault`: one of `NAMES`; `rate`: [Hz].
     """
     y = y.copy()
     n = y.size

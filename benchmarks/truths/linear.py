@@ -61,12 +61,9 @@ class Cascade:
     """
     Modes side by side, then first-order poles in a row; static gain 1.
 
-    Attributes
-    ----------
-    modes : tuple of (frequency [Hz], damping ratio, share)
-        share w^2 / (s^2 + 2 zeta w s + w^2) each; the shares need not add up to 1.
-    poles : tuple of float
-        Corner frequencies of amplifier and sensor [Hz].
+    `modes`: tuple of (frequency [Hz], damping ratio, share): share w^2 / (s^2 + 2 zeta w s + w^2)
+    each; the shares need not add up to 1; `poles`: corner frequencies of amplifier and sensor
+    [Hz].
     """
 
     modes: tuple[tuple[float, float, float], ...]
@@ -119,10 +116,7 @@ class Cascade:
         """
         Return the cascade with mass added to its first mode.
 
-        Parameters
-        ----------
-        change : float
-            Wanted rms of the change of the complex gain over `BAND`.
+        `change`: wanted rms of the change of the complex gain over `BAND`.
         """
         (frequency, zeta, share), *others = self.modes
         before = self.response(BAND)
@@ -163,14 +157,9 @@ class Linear:
     """
     Modes side by side, a sensor's pole, a delay.
 
-    Attributes
-    ----------
-    modes : tuple of (frequency [Hz], damping ratio, share)
-        The shares add up to 1; neighbours of one sign have an antiresonance between them.
-    pole : float
-        Corner of the sensor [Hz].
-    delay : float
-        [s], of any fraction of a sample.
+    `modes`: tuple of (frequency [Hz], damping ratio, share): The shares add up to 1; neighbours of
+    one sign have an antiresonance between them; `pole`: corner of the sensor [Hz]; `delay`: [s],
+    of any fraction of a sample.
     """
 
     modes: tuple[tuple[float, float, float], ...]
@@ -218,14 +207,8 @@ def ridden(h: Array, change: float, frequency: float) -> Array:
     """
     Return what is added when a part of the motion goes through a mode of its own.
 
-    Parameters
-    ----------
-    h : ndarray, shape (n,)
-        Input of the dynamics.
-    change : float
-        Wanted rms of the change of the complex gain over `BAND`.
-    frequency : float
-        Of the mode [Hz].
+    `h`: input of the dynamics; `change`: wanted rms of the change of the complex gain over `BAND`;
+    `frequency`: of the mode [Hz].
     """
     stiff = 3000.0
     mode = Cascade(((frequency, 0.03, 1.0),), (stiff,))
@@ -286,16 +269,8 @@ def relaxation(h: Array, law: str, amount: float, up: float = 1.0, rate: float =
     the law `power`, whose spectrum is (tau / t0)^nu exp(-t0 / tau) / Gamma(1 - nu) d ln tau; 60
     exponentials from 4 ms to 4000 s stand for it.
 
-    Parameters
-    ----------
-    h : ndarray, shape (n,)
-    law : {'log', 'power'}
-    amount : float
-        Per factor e of time, early on.
-    up : float
-        Multiplies what is still missing after rises; 0 makes them immediate.
-    rate : float
-        [Hz]
+    `law`: {'log', 'power'}; `amount`: per factor e of time, early on; `up`: multiplies what is
+    still missing after rises; 0 makes them immediate; `rate`: [Hz].
     """
     t0, nu = 0.02, 0.12
     tau = np.geomspace(0.004, 4000.0, 60)

@@ -98,21 +98,11 @@ def record_motion(
     """
     Return what a record is driven with.
 
-    Parameters
-    ----------
-    name : {'identification', 'diagnosis', 'unseen'}
-        The identification is for unlabelled records; the labelled ones follow a program.
-    rate : float
-        [Hz]
-    rng : numpy.random.Generator
-    labelled : bool
-        Unlabelled ones start anywhere, and their parts come in any order.
-    poorer : str
-        One of `POORER` that a diagnosis record lacks, or nothing.
-    first : float
-        First mode [Hz], which labs know well enough to excite it.
-    rest : float
-        Where a labelled record rests.
+    `name`: {'identification', 'diagnosis', 'unseen'}: The identification is for unlabelled
+    records; the labelled ones follow a program; `rate`: [Hz]; `labelled`: unlabelled ones start
+    anywhere, and their parts come in any order; `poorer`: one of `POORER` that a diagnosis record
+    lacks, or nothing; `first`: first mode [Hz], which labs know well enough to excite it; `rest`:
+    where a labelled record rests.
     """
     # long records at high rates cost too much
     pace = {10_000.0: 1.0, 20_000.0: 0.9, 50_000.0: 0.6}.get(rate, 1.0)

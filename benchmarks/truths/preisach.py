@@ -30,10 +30,7 @@ def everett_table(density: Callable[[Array, Array], Array]) -> tuple[Array, Arra
     """
     Return the Everett function on the corners of `CELLS` x `CELLS` cells, and their densities.
 
-    Parameters
-    ----------
-    density : callable
-        Of the relays that rise at a and fall at b <= a, both 0 .. 1.
+    `density`: of the relays that rise at a and fall at b <= a, both 0 .. 1.
     """
     middle = (np.arange(CELLS) + 0.5) / CELLS
     a, b = np.meshgrid(middle, middle, indexing='ij')

@@ -42,15 +42,8 @@ def basis(stage: FamilyStage, v: Array, name: str, form: str) -> tuple[Array, in
     """
     Return the columns of a form behind the stage's linear part, with an offset, thinned.
 
-    Parameters
-    ----------
-    stage : FamilyStage
-    v : ndarray, shape (n,)
-        [V]
-    name : str
-        Of the record: the past of the plays is the stage's own.
-    form : str
-        One of `FORMS`.
+    `v`: [V]; `name`: of the record: the past of the plays is the stage's own; `form`: one of
+    `FORMS`.
     """
     low, high = stage.limits
     u = (v - low) / (high - low)
@@ -92,14 +85,8 @@ def references(
     a stage that is no sum of plays creeps away in the steps and the noise; the one that predicts
     better is kept.
 
-    Parameters
-    ----------
-    stage : FamilyStage
-    records : mapping of str to (v, y)
-        Identification and unseen: command [V], and displacement in parts of the stroke.
-    forms : tuple of str, optional
-    sweeps : sequence of (start, stop), optional
-        Samples of the identification that follow its triangles.
+    `records`: identification and unseen: command [V], and displacement in parts of the stroke;
+    `sweeps`: samples of the identification that follow its triangles.
     """
     found = {}
     for form in forms:

@@ -80,15 +80,9 @@ def dragged_moments_of(
     """
     Return a sum of moments along the axis that u changes.
 
-    Parameters
-    ----------
-    middle : float
-        Where the field has no component along the axis.
-    tether, bow, weight : ndarray, shape (n,)
-        Of each moment: how far the field leaves it behind, the field across the axis over the
-        square of the one along it, and its share.
-    full : float
-        Size to which a moment saturates.
+    `middle`: where the field has no component along the axis; `tether`, `bow`, `weight`: of each
+    moment: how far the field leaves it behind, the field across the axis over the square of the
+    one along it, and its share; `full`: size to which a moment saturates.
     """
     return law_of(_dragged, middle, tether, bow, weight, full)
 
@@ -165,13 +159,9 @@ def random_bonds_of(bias: Array, friction: Array, bond: Array) -> Law:
     """
     Return the share of spins on a ring that are up, from none.
 
-    Parameters
-    ----------
-    bias, friction : ndarray, shape (n,)
-        Residual field of each spin, and how far the field must be against it.
-    bond : ndarray, shape (n, m)
-        Field of each spin at the next m, and of those at it; m is small beside n, and n a multiple
-        of `NEAR`.
+    `bias`, `friction`: residual field of each spin, and how far the field must be against it;
+    `bond`: field of each spin at the next m, and of those at it; m is small beside n, and n a
+    multiple of `NEAR`.
     """
     return law_of(_bonds, bias, friction, bond)
 
@@ -228,13 +218,9 @@ def loaded_sliders_of(stiff: Array, limit: Array, lean: float, bend: float) -> L
     """
     Return the charge behind sliders and a capacitor.
 
-    Parameters
-    ----------
-    stiff, limit : ndarray, shape (n,)
-        Of each slider: its spring, and where it slips at half the charge.
-    lean, bend : float
-        How much the limits, and the stiffness of the capacitor, grow up to the full charge, less
-        than 1.
+    `stiff`, `limit`: of each slider: its spring, and where it slips at half the charge; `lean`,
+    `bend`: how much the limits, and the stiffness of the capacitor, grow up to the full charge,
+    less than 1.
     """
     return law_of(_sliders, stiff, limit, lean, bend, np.zeros(stiff.size))
 

@@ -44,10 +44,7 @@ def size_of(change: Array, without: Array) -> float:
     """
     Return the rms of a change behind the best offset and gain [% of stroke].
 
-    Parameters
-    ----------
-    change, without : ndarray, shape (n,)
-        What the effect adds, and the answer without it.
+    `change`, `without`: what the effect adds, and the answer without it.
     """
     x = without - without.mean()
     e = change - change.mean()
@@ -61,16 +58,8 @@ def scaled(
     """
     Return the parameter of an effect and the size that it has on the diagnosis record.
 
-    Parameters
-    ----------
-    stage : FamilyStage
-    effect : str
-    wanted : float
-        Size [% of stroke], kept within `LEAST` and `LARGEST` and what the law may reach.
-    v : ndarray, shape (n,)
-        Command of the diagnosis record [V].
-    other : ndarray, shape (n,), optional
-        Voltage of the other axis [V].
+    `wanted`: size [% of stroke], kept within `LEAST` and `LARGEST` and what the law may reach;
+    `v`: command of the diagnosis record [V]; `other`: voltage of the other axis [V].
     """
     wanted = min(max(wanted, LEAST), LARGEST)
     weak, strong = AMOUNTS[effect]

@@ -33,17 +33,8 @@ class Base:
     """
     The stage without any effect.
 
-    Attributes
-    ----------
-    core : {'plays', 'everett'}
-        How the hysteresis is computed.
-    density : Density
-        Of the thresholds.
-    polynomial : tuple of float
-        Factors of u, u^3 and u^5.
-    dynamics : Cascade or ARX
-    delay : float
-        [s]
+    `core`: {'plays', 'everett'}: How the hysteresis is computed; `density`: of the thresholds;
+    `polynomial`: factors of u, u^3 and u^5; `delay`: [s].
     """
 
     core: str
@@ -97,19 +88,10 @@ class Stage(Affected):
     """
     A stage, perhaps with effects, behind a sampled sensor.
 
-    Attributes
-    ----------
-    base : Base
-    gains : mapping of str to float
-        Parameter of every effect's law; 0 (infinity for slew_limit) is none.
-    variants : mapping of str to int
-        Which form of its law every effect takes.
-    seed : int
-    noise : {'white', '1/f', '10-bit', 'none'}
-        White, or with a density of 1/f, of the same rms over a record; or white, and then rounded
-        to 1/1024 of the span.
-    noise_rms : float
-        Share of the span.
+    `gains`: parameter of every effect's law; 0 (infinity for slew_limit) is none; `variants`:
+    which form of its law every effect takes; `noise`: {'white', '1/f', '10-bit', 'none'}: White,
+    or with a density of 1/f, of the same rms over a record; or white, and then rounded to 1/1024
+    of the span; `noise_rms`: share of the span.
     """
 
     base: Base
@@ -133,20 +115,10 @@ class Stage(Affected):
         """
         Return the measured displacement [m], shape (n,), of a stage that was at rest at 0 V.
 
-        Parameters
-        ----------
-        t : array_like, shape (n,)
-            Time [s], at `RATE`.
-        v : array_like, shape (n,)
-            Command held between samples [V], 0 .. 10.
-        changed : bool
-            False: as it was before the effects of `LATER` set in.
-        channels : mapping of str to array_like, optional
-            ``other``: voltage of another axis [V]; at rest when absent.
-        take : int
-            Another draw of noise, phases and drifts for the same voltage.
-        clean : bool
-            Without sensor noise.
+        `t`: time [s], at `RATE`; `v`: command held between samples [V], 0 .. 10; `changed`: False:
+        as it was before the effects of `LATER` set in; `channels`: ``other``: voltage of another
+        axis [V]; at rest when absent; `take`: another draw of noise, phases and drifts for the
+        same voltage; `clean`: without sensor noise.
         """
         time = np.asarray(t, dtype=np.float64)
         volts = np.ascontiguousarray(v, dtype=np.float64)
@@ -225,23 +197,10 @@ def make_stage(
     """
     Return a stage with undeclared effects.
 
-    Parameters
-    ----------
-    effect : str, tuple of str or None
-        Names out of `EFFECTS` and `OUTSIDE`.
-    strength : float
-        What about is left of each effect on the diagnosis program after the best refit of
-        weights, polynomial and offset of the base [% of stroke, rms].
-    seed : int
-        Of the stage, and of the form of each law.
-    noise : {'white', '1/f', '10-bit', 'none'}
-    noise_rms : float
-        Share of the span.
-
-    Raises
-    ------
-    ValueError
-        When an effect or a noise is unknown.
+    `effect`: names out of `EFFECTS` and `OUTSIDE`; `strength`: what about is left of each effect
+    on the diagnosis program after the best refit of weights, polynomial and offset of the base [%
+    of stroke, rms]; `seed`: of the stage, and of the form of each law; `noise`: {'white', '1/f',
+    '10-bit', 'none'}; `noise_rms`: share of the span.
     """
     names = () if effect is None else (effect,) if isinstance(effect, str) else tuple(effect)
     for name in names:

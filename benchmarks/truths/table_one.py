@@ -32,12 +32,7 @@ class TableOneStage:
     """
     The published hysteresis and dynamics with plays that widen with speed, and with creep.
 
-    Attributes
-    ----------
-    parameters : dict
-        As in table_one.yaml.
-    seed : int
-        Of the noise.
+    `parameters`: as in table_one.yaml; `seed`: of the noise.
     """
 
     parameters: dict[str, Any]
@@ -49,21 +44,8 @@ class TableOneStage:
         """
         Return the measured displacement [m], shape (n,), of a stage that was at rest at 0 V.
 
-        Parameters
-        ----------
-        t : array_like, shape (n,)
-            [s], uniform, at 20 kHz.
-        v : array_like, shape (n,)
-            [V]
-        changed : bool
-            No difference: what is undeclared was always there.
-        clean : bool
-            Without sensor noise.
-
-        Raises
-        ------
-        ValueError
-            When the rate is not 20 kHz, at which the dynamics are given.
+        `t`: [s], uniform, at 20 kHz; `v`: [V]; `changed`: no difference: what is undeclared was
+        always there; `clean`: without sensor noise.
         """
         time, volts = (np.ascontiguousarray(x, dtype=np.float64) for x in (t, v))
         if abs((time[-1] - time[0]) * RATE / (time.size - 1) - 1) > 1e-6:
@@ -89,17 +71,7 @@ def table_one_stage(seed: int = 0, **changes: dict[str, float]) -> TableOneStage
     """
     Return the stage of table_one.yaml.
 
-    Parameters
-    ----------
-    seed : int
-        Of the noise.
-    **changes : dict
-        Entries of `rate` and `creep` to replace.
-
-    Raises
-    ------
-    ValueError
-        When a number in the file is not finite.
+    `seed`: of the noise; `**changes`: entries of `rate` and `creep` to replace.
     """
     data = yaml.safe_load(PARAMETERS.read_text(encoding='utf-8'))
     for name, values in changes.items():

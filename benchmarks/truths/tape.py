@@ -23,16 +23,8 @@ class Tape:
     """
     Pieces of a motion in a row; every piece is joined to the one before by a soft move.
 
-    Parameters
-    ----------
-    rate : float
-        [Hz]
-    speed : float
-        Top speed of the moves, in units of the motion a second.
-    level : float
-        Where it starts.
-    pace : float
-        Factor by which all but moves, rests and jumps are shorter.
+    `rate`: [Hz]; `speed`: top speed of the moves, in units of the motion a second; `level`: where
+    it starts; `pace`: factor by which all but moves, rests and jumps are shorter.
     """
 
     def __init__(self, rate: float, speed: float, level: float = 0.0, pace: float = 1.0) -> None:
@@ -129,24 +121,9 @@ def program(
     """
     Return time [s], command [V] and labelled segments, from rest to rest at 0 V.
 
-    Parameters
-    ----------
-    kind : {'diagnosis', 'unseen'}
-        About 17 s that show every effect; about 12 s with other frequencies, levels and holds.
-    seed : int
-        Of the phases of the multisine and the order of the levels.
-    sample_rate : float
-        [Hz]
-
-    Returns
-    -------
-    t, v : ndarray, shape (n,)
-    labels : list of (label, start, stop)
-
-    Raises
-    ------
-    ValueError
-        When the kind is unknown.
+    `kind`: {'diagnosis', 'unseen'}: About 17 s that show every effect; about 12 s with other
+    frequencies, levels and holds; `seed`: of the phases of the multisine and the order of the
+    levels; `sample_rate`: [Hz].
     """
     rng = np.random.default_rng([55, seed])
     tape = _Voltages(sample_rate, SPEED)
