@@ -4,9 +4,9 @@
 """
 Bags as rosbag2 of Jazzy writes them.
 
-rosbags gives its own name for the distribution, and leaves the hash of the type out of an mcap
-channel.  Both are put in on the way to its storage, which is an internal of it: `setup.py` bounds
-the version, and a test reads what was written.
+rosbags writes its own name for the distribution, and no hash of the type into an mcap channel.
+`JazzyWriter` adds both between rosbags and its storage.  The storage is an internal of rosbags:
+`setup.py` bounds the version, and a test reads written bags.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from piezo_ident.common.files import write_text
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import storage_mcap, StoragePlugin, Writer
 
-#: that the message types are of
+#: the message types belong to this distribution
 DISTRIBUTION = 'jazzy'
 
 
@@ -28,7 +28,7 @@ class JazzyWriter(Writer):
     """Writer of bags with the distribution and the type hashes that rosbag2 of Jazzy writes."""
 
     def open(self) -> None:
-        """Open the bag, and put the two additions between it and its storage."""
+        """Open the bag, and put the additions between it and its storage."""
         super().open()
         storage: Any = self.storage
         close = storage.close
@@ -39,7 +39,7 @@ class JazzyWriter(Writer):
             storage.conn.execute('UPDATE schema SET ros_distro = ?', (DISTRIBUTION,))
 
     def close(self) -> None:
-        """Finish the bag."""
+        """Finish the bag, and name the distribution in its metadata."""
         super().close()
         write_text(self.metapath, _named(self.metapath.read_text('utf8')))
 
