@@ -82,7 +82,7 @@ class Resolution:
         if self.single:
             half = np.maximum(half, 0.5 * np.spacing(np.abs(t).astype(np.float32)))
         # steps of one or two units of the last decimal are exact more often than rounded
-        return np.minimum(half, 0.2 * dt) + 8 * np.spacing(np.abs(t))
+        return np.asarray(np.minimum(half, 0.2 * dt) + 8 * np.spacing(np.abs(t)))
 
 
 def _rounded_to(x: Array, decimals: NDArray[np.int_]) -> bool:

@@ -281,12 +281,7 @@ def _choose(
     carried: Mapping[str, str], asked: Mapping[str, str | None], namespace: str | None, path: Path
 ) -> dict[str, str]:
     """Return the topic of each quantity, the applied voltage among them if it is there."""
-    chosen = {
-        quantity: _measured_topic(carried, quantity, namespace, path)
-        if topic is None
-        else _asked_topic(carried, quantity, f'/{topic.lstrip("/")}', path)
-        for quantity, topic in asked.items()
-    }
+    chosen = {q: _topic_of(carried, q, topic, namespace, path) for q, topic in asked.items()}
     home = chosen['voltage'].rpartition('/')[0] + '/'
     applied = f'{home}{APPLIED}'
     if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
@@ -305,25 +300,18 @@ def _choose(
     return chosen
 
 
-def _asked_topic(carried: Mapping[str, str], quantity: str, topic: str, path: Path) -> str:
-    if topic not in carried:
-        raise DataError(
-            f'{path}: no samples on topic {topic}; topics with samples: '
-            + ', '.join(sorted(carried))
-        )
-    if carried[topic] != quantity:
-        fit = sorted(t for t, q in carried.items() if q == quantity)
-        raise DataError(
-            f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
-            f'{quantity}: {", ".join(fit) or "none"}'
-        )
-    return topic
-
-
-def _measured_topic(
-    carried: Mapping[str, str], quantity: str, namespace: str | None, path: Path
+def _topic_of(
+    carried: Mapping[str, str], quantity: str, asked: str | None, namespace: str | None, path: Path
 ) -> str:
-    """Return the one topic with a measured quantity below a namespace."""
+    """Return the topic that is asked for, or the one measured topic below a namespace."""
+    topics = ', '.join(f'{topic} ({carried[topic]})' for topic in sorted(carried))
+    if asked is not None:
+        topic = f'/{asked.lstrip("/")}'
+        if carried.get(topic) != quantity:
+            has = f'{topic} carries {carried[topic]}, not {quantity}'
+            fault = has if topic in carried else f'no samples on topic {topic}'
+            raise DataError(f'{path}: {fault}; topics with samples: {topics}')
+        return topic
     prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
     there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
     # a model fitted to the prediction of another would look perfect
@@ -340,8 +328,7 @@ def _measured_topic(
     if not fit:
         below = '' if namespace is None else f' below {prefix}'
         raise DataError(
-            f"{path}: no topic carries 't,{quantity}'{below}; topics with samples: "
-            + ', '.join(sorted(carried))
+            f"{path}: no topic carries 't,{quantity}'{below}; topics with samples: {topics}"
         )
     if len(fit) > 1:
         raise DataError(

@@ -39,10 +39,6 @@ _STAMP = re.compile(
     re.ASCII,
 )
 _DAY = 86_400 * 10**9
-_POINTS = (
-    'these look like decimal commas: save it with decimal points, or with semicolons between '
-    'the columns'
-)
 
 
 def read_text(path: Path, options: ReadOptions) -> RecordTable:
@@ -220,10 +216,12 @@ def _culprit(
     for number, row in enumerate(rows, line):
         at = f'{path}: line {line + reader.line_num - 1 if reader else number}'
         if len(row) <= max(wanted.values()) or (separator == ',' and len(row) != width):
-            return DataError(
-                f'{at} has {len(row)} columns, the header has {width}; '
-                + (_POINTS if _torn_at_commas(row, width, wanted) else 'mend or delete the line')
-            )
+            # decimal commas may have been taken for separators
+            whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
+            torn = width < len(row) <= 2 * width and len(row) - whole <= width - len(wanted)
+            cure = 'save it with decimal points, or with semicolons between the columns'
+            cure = f'these look like decimal commas: {cure}' if torn else 'mend or delete the line'
+            return DataError(f'{at} has {len(row)} columns, the header has {width}; {cure}')
         for name, place in wanted.items():
             text = row[place].strip()
             title = layout.names[place] if layout.names else name
@@ -253,12 +251,6 @@ def _all_text(column: str, text: str, name: str, layout: Layout) -> DataError:
         f'{column} holds text, {text[:40]!r}, no numbers; {cure}, as in {way}',
         options=way if name == 't' else '',
     )
-
-
-def _torn_at_commas(row: list[str], width: int, wanted: dict[str, int]) -> bool:
-    """Return whether decimal commas of a row may have been taken for separators."""
-    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
-    return width < len(row) <= 2 * width and len(row) - whole <= width - len(wanted)
 
 
 def write_csv(
