@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-#: numbers taken together, so that temporaries stay small beside a long record
-_CHUNK = 1 << 20
+#: numbers that are looked at together, so that temporaries stay small beside a long record
+CHUNK = 1 << 20
 #: share of the range, and multiple of the usual step between two numbers, by which one without
 #: neighbours may leave the range
 _LONE, _STEPS = 0.25, 4.0
@@ -106,5 +106,5 @@ def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
 
 def _chunks(parts: Sequence[Array], overlap: int = 0) -> Iterator[Array]:
     for x in parts:
-        for i in range(0, x.size, _CHUNK):
-            yield x[i : i + _CHUNK + overlap]
+        for i in range(0, x.size, CHUNK):
+            yield x[i : i + CHUNK + overlap]

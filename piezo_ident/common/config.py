@@ -20,7 +20,7 @@ _SOURCE = Path(__file__).resolve().parents[2] / 'config'
 
 
 def _folders() -> Iterator[Path]:
-    """Yield where the files may be: a ROS workspace, an environment, the source tree."""
+    """Yield the folders of the files: a ROS workspace, an environment, the source tree."""
     # as ament_index_python does
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         if prefix:
@@ -34,18 +34,17 @@ def _folders() -> Iterator[Path]:
 
 
 def shipped_names(prefix: str = '') -> list[str]:
-    """Return the names of shipped files with a prefix, ``program_`` or ``stage_``, without it."""
+    """Return the names, without prefix, of shipped files: ``program_`` or ``stage_``."""
     found = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
     return sorted(name.removeprefix(prefix) for name in found)
 
 
 def find_config(name: str | os.PathLike[str], kind: str) -> Path:
     """
-    Return the file that a name or a path of a program or a stage, the `kind`, stands for.
+    Return the file of a program or a stage, the `kind`, by its name or path.
 
-    ``identification`` is the shipped ``program_identification.yaml``.  A path is taken as it is;
-    where nothing stands there, the shipped file of the same name is.  Otherwise a
-    ConfigError names the shipped files.
+    ``identification`` is the shipped ``program_identification.yaml``.  A path without a file means
+    the shipped file of the same name.  Otherwise a ConfigError names the shipped files.
     """
     path = Path(name)
     plain = path.suffix == '' and path.name == str(name)

@@ -6,7 +6,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: what a message quotes may come from a file, and be of any length
+#: longest message [characters]: it may quote a file
 _LONGEST = 4000
 
 
@@ -24,14 +24,8 @@ class PiezoIdentError(Exception):
     """
     Base of every error that this package raises on purpose.
 
-    Its message is one line without control characters, which could steer a terminal, whatever
-    names of a file it quotes.
-
-    Parameters
-    ----------
-    message : str
-    options : str
-        Options to add to the command line, as they are typed, where these mend it.
+    Its message is one line without control characters, which could steer a terminal.  Its
+    `options` are an addition to the command line, as it is typed, that mends the error.
     """
 
     def __init__(self, message: str = '', *, options: str = '') -> None:
@@ -44,16 +38,7 @@ class DataError(PiezoIdentError):
 
 
 class OrderError(DataError):
-    """
-    Samples whose times are in no order.
-
-    Parameters
-    ----------
-    fact : str
-        What is wrong, and where.
-    cure : str
-        What to do where they come from a table.
-    """
+    """Samples whose times are in no order: the fault with its place, and the cure of a table."""
 
     def __init__(self, fact: str, cure: str) -> None:
         super().__init__(f'{fact}; {cure}')
@@ -79,9 +64,9 @@ class Cancelled(PiezoIdentError):
 @contextmanager
 def naming(*names: str, model: str = '') -> Iterator[None]:
     """
-    Put the names of the inputs before messages that do not name one of them.
+    Put the names of the inputs before messages without one of these names.
 
-    Where a `model` is given, what is wrong with the model is said of it alone.
+    A ModelError gets the name of the `model` alone, if it is given.
     """
     try:
         yield
@@ -95,14 +80,7 @@ def naming(*names: str, model: str = '') -> Iterator[None]:
 
 
 def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) -> None:
-    """
-    Refuse an argument of another type than the one that belongs there.
-
-    Raises
-    ------
-    DataError
-        Names the expected type, the type of the argument, and the cure.
-    """
+    """Refuse an argument of another type with a DataError that names both types and the cure."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         names = ' or '.join(k.__name__ for k in kinds)

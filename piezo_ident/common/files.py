@@ -4,8 +4,8 @@
 """
 Files: outputs that appear whole or not at all, and YAML by the safe loader.
 
-An output is written under a temporary name beside its place and renamed.  What a killed process
-leaves behind is called ``.<name>.<random>.tmp`` and can be deleted.
+An output is written under a temporary name beside its place and renamed.  The leftovers of a
+killed process are called ``.<name>.<random>.tmp`` and can be deleted.
 """
 
 from __future__ import annotations
@@ -26,16 +26,13 @@ import yaml
 
 #: the largest YAML text [characters, 20 us each], and values in it with aliases written out
 YAML_SIZE = 500_000
-#: what the samples of one file may unpack to [bytes]: four hours of three columns at 20 kHz
+#: most bytes of unpacked samples of one file: four hours of three columns at 20 kHz
 UNPACKED_SIZE = 8 << 30
 
-#: files that a bag consists of
+#: the files of a bag
 _BAG_FILE = re.compile(r'metadata\.yaml|.*\.(mcap|db3)(\.zstd|-wal|-shm|-journal)?')
 #: merge keys double a mapping with every line
 _MERGE_KEY = re.compile(r'(^|[{,])\s*<<\s*:', re.MULTILINE)
-
-
-# --- inputs ---------------------------------------------------------------------------------
 
 
 def broken_link(path: str | os.PathLike[str]) -> str | None:
@@ -46,7 +43,7 @@ def broken_link(path: str | os.PathLike[str]) -> str | None:
 
 
 def check_regular(path: Path) -> None:
-    """Refuse folders, and devices and pipes, which have no end, with a DataError."""
+    """Refuse folders, and devices and pipes, whose data never end, with a DataError."""
     if not path.is_file():
         kind = 'a folder' if path.is_dir() else 'a device or a pipe'
         raise DataError(f'{path}: is {kind}, no file; copy the data into a file')
@@ -60,8 +57,7 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     file = Path(path)
     try:
-        broken = broken_link(file)
-        if broken:
+        if broken := broken_link(file):
             raise ConfigError(f'{path}: {broken}')
         if file.exists():
             check_regular(file)
@@ -121,9 +117,6 @@ def _count(node: object, count: int, name: str) -> int:
         if count > YAML_SIZE:
             raise ConfigError(f'{name}: too large, {YAML_SIZE} values at most; check the name')
     return count
-
-
-# --- outputs --------------------------------------------------------------------------------
 
 
 @contextmanager

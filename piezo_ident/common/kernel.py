@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How a numerical loop becomes a compiled kernel: cached on disk, without the interpreter lock.
+Compiled numerical loops (kernels): cached on disk, without the interpreter lock.
 
-Compiled kernels are kept in the folder ``NUMBA_CACHE_DIR`` where that is set, else in
-``__pycache__`` beside their files, else, where the installation cannot be written, in the cache of
-the user (``~/.cache/numba``).  Where none of them can be written, each process compiles its
-kernels again.  A process that compiles says so on the log ``piezo_ident``, once.
+Kernels are kept in the folder ``NUMBA_CACHE_DIR`` if that is set, else in ``__pycache__`` beside
+their files, else in the cache of the user (``~/.cache/numba``).  If none of these can be written,
+each process compiles its kernels again, and logs that once to ``piezo_ident``.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from numba.core import event
 
 F = TypeVar('F', bound=Callable[..., Any])
 
-#: what is smaller has died away
+#: a smaller signal has died away
 STILL = 1e-280
 
 
@@ -29,19 +28,14 @@ def kernel(function: F) -> F:
     """
     Compile a function of arrays and numbers.
 
-    Sums may be reassociated, so that they run in vector lanes; nothing else of IEEE arithmetic is
-    given up.  The order of a sum is fixed when the kernel is compiled, so a stream gives the same
-    bits wherever it is cut.
+    Sums may be reassociated to run in vector lanes; all other IEEE arithmetic stays.  The compiler
+    fixes the order of a sum, so a stream gives the same bits wherever it is cut.
     """
     return _compiled(function, fastmath={'reassoc'})
 
 
 def ordered_kernel(function: F) -> F:
-    """
-    Compile a function that adds in the very order in which it is written.
-
-    For sums that run in vector lanes side by side, or that several loops must form alike.
-    """
+    """Compile a function whose sums keep their order: lanes side by side, or equal loops."""
     return _compiled(function)
 
 
@@ -60,7 +54,7 @@ def _compiled(function: F, **options: Any) -> F:
 
 
 class _Notice(event.Listener):
-    """Says that a process compiles kernels, when the first of them is not in the cache."""
+    """Logs that a process compiles kernels, at the first kernel that is not in the cache."""
 
     def __init__(self) -> None:
         self.kernels: list[Any] = []
@@ -82,7 +76,7 @@ class _Notice(event.Listener):
         )
 
     def on_end(self, event: Any) -> None:
-        """Say nothing: the next line of the program tells."""
+        """Log nothing: the next line of the program tells."""
 
 
 _NOTICE = _Notice()
@@ -92,12 +86,10 @@ event.register('numba:compile', _NOTICE)  # type: ignore[no-untyped-call]
 @ordered_kernel
 def alive(x: float) -> float:
     """
-    Return x, or zero when it has died away.
+    Return x, or zero for an x that has died away.
 
     The state of a filter whose input rests falls to subnormal numbers, which take a processor a
-    hundred times as long.
-
-    This function is compiled into each loop that calls it.  Loops are cached until their own file
-    changes, so the caches have to be emptied when this function changes.
+    hundred times as long.  This function is compiled into each loop that calls it.  Loops are
+    cached until their own file changes: empty the caches when this function changes.
     """
     return 0.0 if abs(x) < STILL else x

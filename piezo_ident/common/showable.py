@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a result shows itself: text at a prompt, a table and a picture in a notebook."""
+"""Views of a result: text at a prompt, a table and a picture in a notebook."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ if TYPE_CHECKING:
 
 
 class Showable:
-    """Base of what is shown through the front door, which alone may look down to the reports."""
+    """Base of all results with a view; the front door alone imports the reports below."""
 
     def plot(self: Any) -> Figure:
-        """Draw the picture that tells most of it; see `piezo_ident.report.plot`."""
+        """Draw the result in one picture; see `piezo_ident.report.plot`."""
         import piezo_ident as pi
 
         return pi.report.plot(self)
 
     def to_json(self: Any) -> dict[str, Any]:
-        """Convert it to plain data for strict JSON; see `piezo_ident.report.to_json`."""
+        """Convert the result to plain data for strict JSON; see `piezo_ident.report.to_json`."""
         import piezo_ident as pi
 
         return pi.report.to_json(self)

@@ -28,24 +28,15 @@ class CCode:
     """
     C code of an operator.
 
+    `numbers` are its constants, `state` the members of the struct with its state.  The statements
+    `rest` bring the state to rest; without them the signal passes unchanged.  The statements
+    `step` process one sample.  An operator may need one further `channel`.
+
     The statements read the signal from `x` and write the result to `x`.  They may use the numbers
     and the further channel `c` by name, the state as ``s->name``, the normalised command `v` and
     the time `t` [s].  `u` is the signal into H; in the slot ``hysteresis``, `x` is the output of
     H.  The functions ``piezo_alive``, ``piezo_held`` and ``piezo_curve`` stand for
     `piezo_ident.common.kernel.alive`, and for `held` and `curve` of the kernels.
-
-    Attributes
-    ----------
-    numbers : mapping of str to float, int or ndarray, shape (n,)
-        Constants.
-    state : str
-        Members of the struct that holds the state.
-    rest : str
-        Statements that bring the state to rest; without them the signal passes unchanged.
-    step : str
-        Statements for one sample; empty if the operator does nothing.
-    channel : str
-        Name of the further channel that the operator needs, or empty.
     """
 
     numbers: Numbers = field(default_factory=dict)
@@ -82,6 +73,7 @@ _LAGS = """
     const double *const line = lines + (to > s->last ? 3 * n : 0);
     double left = 0.0;
     int j;
+
     lags = 0.0;
     for (j = 0; j < n; j++) {
         if (length > 0.0) {
@@ -101,6 +93,7 @@ _LAGS_AT_REST = """
     const double way[5] = {high, low, high, low, x};
     double lags;
     int i;
+
     for (i = 0; i < n; i++)
         s->z[i] = low * (d1[i] + low * (d2[i] + low * d3[i]));
     s->last = low;
@@ -145,9 +138,11 @@ _G = """
 const double *past;
 double y = 0.0, other = 0.0;
 int i;
+
 s->w[s->at_w] = s->w[s->at_w + nb] = x;
 s->at_w = s->at_w + 1 < nb ? s->at_w + 1 : 0;
 past = s->w + s->at_w;
+
 for (i = nb % 2; i < nb; i += 2) {
     other += b[i] * past[i];
     y += b[i + 1] * past[i + 1];
@@ -161,6 +156,7 @@ for (i = na % 2; i < na; i += 2) {
     other -= a[i] * past[i];
     y -= a[i + 1] * past[i + 1];
 }
+
 if (na % 2)
     other -= a[0] * past[0];
 y = piezo_alive(y + other);
@@ -184,12 +180,11 @@ _G_BACK_AT_REST = """
         s->y[i] = x;
 }
 """
-
-
 _SECTIONS = """
 double (*z)[2] = s->z;
 const double *g = sections;
 int i;
+
 for (i = 0; i < n; i++, g += 5) {
     const double y = g[0] * x + z[i][0];
     z[i][0] = piezo_alive((g[1] * x + z[i][1]) - g[3] * y);
@@ -236,10 +231,6 @@ def delay_in_c(delay: Delay) -> CCode:
     state = f'double line[{n}];\nint at;\n'
     rest = '{\nint i;\ns->at = 0;\nfor (i = 0; i < n; i++)\n    s->line[i] = x;\n}\n'
     step = 's->line[s->at] = x;\ns->at = s->at + 1 < n ? s->at + 1 : 0;\n'
-    if between:
-        step += (
-            'x = (1.0 - part) * s->line[s->at + 1 < n ? s->at + 1 : 0] + part * s->line[s->at];\n'
-        )
-    else:
-        step += 'x = s->line[s->at];\n'
+    now = '(1.0 - part) * s->line[s->at + 1 < n ? s->at + 1 : 0] + part * s->line[s->at]'
+    step += f'x = {now if between else "s->line[s->at]"};\n'
     return CCode({'n': n, 'part': delay.fraction}, state, rest, step)

@@ -24,18 +24,10 @@ Slot = Literal['input', 'hysteresis', 'hidden', 'output', 'acquisition']
 @dataclass(frozen=True, eq=False)
 class Block:
     """
-    The next samples of a stream.
+    The next samples of a stream; shapes (n,).
 
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Time [s].
-    v : ndarray, shape (n,)
-        Command, normalised; an operator in any slot may use it.
-    x : ndarray, shape (n,)
-        Signal on its way through the chain, normalised.
-    channels : mapping of str to ndarray, shape (n,)
-        Further measured signals in their own units.
+    `t` is the time [s], `v` the normalised command, which an operator in any slot may use, and `x`
+    the normalised signal on its way through the chain.  The channels keep their own units.
     """
 
     t: Array

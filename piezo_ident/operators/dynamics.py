@@ -32,11 +32,7 @@ MAX_MEMORY = 2**40
 
 @dataclass(frozen=True)
 class Mode:
-    """
-    Oscillating pair of poles in continuous time, with standard deviations.
-
-    The natural frequency is in Hz; the damping is a ratio.
-    """
+    """Oscillating pair of poles: natural frequency [Hz], damping ratio, standard deviations."""
 
     frequency: float
     frequency_std: float
@@ -101,7 +97,7 @@ class Dynamics:
         return self.is_within(1.0)
 
     def is_within(self, radius: float) -> bool:
-        """Tell whether every pole is smaller than a radius; the poles are not computed."""
+        """Tell whether every pole is smaller than a radius, without computing the poles."""
         return _is_stable(self.a / radius ** np.arange(1, self.a.size + 1))
 
     def memory(self, share: float) -> int:
@@ -140,17 +136,15 @@ class Dynamics:
             zeros = np.delete(zeros, real[np.argmin(np.abs(zeros[real] - pole))])
         a = np.atleast_1d(np.real(np.poly(poles[~slow])))[1:]
         faster = Dynamics(a=a, b=np.atleast_1d(np.real(np.poly(zeros))))
-        at = [10.0 * slowest]
-        gain = np.abs(self.response(at, sample_rate)) / np.abs(faster.response(at, sample_rate))
-        sign = np.sign(np.real(self.response(at, sample_rate) / faster.response(at, sample_rate)))
-        return Dynamics(a=faster.a, b=faster.b * float(gain[0] * sign[0]))
+        one, other = (g.response([10.0 * slowest], sample_rate)[0] for g in (self, faster))
+        gain = abs(one) / abs(other) * np.sign(np.real(one / other))
+        return Dynamics(a=faster.a, b=faster.b * float(gain))
 
     def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
         """Compute the complex frequency response at frequencies [Hz], shape (n,)."""
         z = np.exp(-2j * np.pi * np.asarray(frequency, dtype=np.float64) / sample_rate)
-        numerator = np.polyval(self.b[::-1], z)
         denominator = np.polyval(np.concatenate([[1.0], self.a])[::-1], z)
-        return np.asarray(numerator / denominator, dtype=np.complex128)
+        return np.asarray(np.polyval(self.b[::-1], z) / denominator, dtype=np.complex128)
 
     def modes(self, sample_rate: float, covariance: Array | None = None) -> list[Mode]:
         """
@@ -178,11 +172,7 @@ class Dynamics:
 
 
 def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
-    """
-    Filter x by B(z)/A(z), shape (n,); a and b as in `Dynamics`.
-
-    `at_rest` starts in equilibrium with the first sample instead of from zero.
-    """
+    """Filter x by B(z)/A(z), shape (n,); `at_rest`, from equilibrium with its first sample."""
     past_w, past_y = b.size - 1, a.size
     w, y = np.empty(past_w + x.size), np.empty(past_y + x.size)
     w[past_w:] = x
@@ -194,8 +184,8 @@ def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
 
 @kernel
 def _is_stable(a: Array) -> bool:
-    # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the magnitude of
-    # the last coefficient is below one and the polynomial of the next lower order passes, too
+    # Schur-Cohn test: all roots of A lie inside the unit circle if and only if the last
+    # coefficient is smaller than one, and the polynomial of the next lower order passes
     a = a.copy()
     for n in range(a.size, 0, -1):
         last = a[n - 1]
@@ -209,15 +199,14 @@ def _is_stable(a: Array) -> bool:
 
 
 def _static_gain(b: Array, a: Array) -> float:
-    numerator, denominator = float(b.sum()), 1.0 + float(a.sum())
-    return numerator / denominator if denominator != 0.0 else float('inf')
+    denominator = 1.0 + float(a.sum())
+    return float(b.sum()) / denominator if denominator != 0.0 else math.inf
 
 
 class DynamicsOperator:
     """
-    G as an operator.
+    G as an operator, with coefficients b and a from the oldest sample to the newest.
 
-    b and a, shapes (nb,) and (na,), are the coefficients from the oldest sample to the newest.
     `change` has the meaning of `piezo_ident.effects.effect.Effect.change`.
     """
 
@@ -227,9 +216,8 @@ class DynamicsOperator:
         self.dynamics = dynamics
         self.b, self.a = dynamics.b[::-1].copy(), dynamics.a[::-1].copy()
         self._past_w, self._past_y = np.zeros(self.b.size - 1), np.zeros(self.a.size)
-        self._sections, self._z = dynamics.sections, np.zeros((0, 2))
-        if self._sections is not None:
-            self._z = np.zeros((self._sections.shape[0], 2))
+        self._sections = dynamics.sections
+        self._z = np.zeros((0 if self._sections is None else len(self._sections), 2))
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to equilibrium with a constant signal."""
@@ -257,11 +245,7 @@ class DynamicsOperator:
 
 @dataclass(frozen=True)
 class Delay:
-    """
-    Pure delay: whole samples d >= 0, and a fraction 0 <= f < 1 by linear interpolation.
-
-    Raises ModelError if a value is out of range.
-    """
+    """Pure delay: whole samples d >= 0, and a fraction 0 <= f < 1 by linear interpolation."""
 
     samples: int
     fraction: float = 0.0

@@ -28,6 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import functools
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,10 +51,7 @@ LINE = 1e-9
 @dataclass(frozen=True, eq=False)
 class Hysteresis:
     """
-    Parameters of H, in normalised units.
-
-    Since ``F_0[v] = v``, a weight at threshold 0 and `p2` are one parameter.  Such a weight is
-    added to `p2`.
+    Parameters of H, in normalised units; a weight at threshold 0 joins `p2`, as ``F_0[v] = v``.
 
     Parameters
     ----------
@@ -76,8 +74,7 @@ class Hysteresis:
     Raises
     ------
     ModelError
-        If lengths differ, a weight or density is negative, or thresholds are negative or not
-        ascending.
+        For different lengths, a weight or density < 0, or thresholds < 0 or not ascending.
 
     Examples
     --------
@@ -102,10 +99,10 @@ class Hysteresis:
             raise ModelError(
                 f'hysteresis: {r.size} thresholds and {q.size} weights; give one weight each'
             )
-        if not (np.all(np.isfinite(r)) and np.all(np.isfinite(q))):
-            raise ModelError('hysteresis: thresholds and weights must be finite numbers')
-        if np.any(q < 0):
-            raise ModelError('hysteresis: weights q_i must not be negative')
+        if not (np.isfinite(r).all() and np.isfinite(q).all() and (q >= 0).all()):
+            raise ModelError(
+                'hysteresis: thresholds and weights must be finite, weights must not be negative'
+            )
         if np.any(r < 0) or np.any(np.diff(r) <= 0):
             raise ModelError('hysteresis: thresholds r_i must ascend and not be negative')
         p2 = float(self.p2)
@@ -139,14 +136,12 @@ class Hysteresis:
             if getattr(self, name) is None:
                 continue
             values = frozen_array(getattr(self, name))
-            if (
-                values.ndim != len(shape)
-                or values.shape[0] != r.size
-                or not 0 < values.shape[-1] <= max(shape[-1], 1)
-            ) and r.size:
+            fits = values.ndim == len(shape) and values.shape[0] == r.size
+            if r.size and not (fits and 0 < values.shape[-1] <= max(shape[-1], 1)):
+                each = '1 to 3 numbers' if name == 'curves' else 'one number'
                 raise ModelError(
                     f'hysteresis: {name} of shape {values.shape} for {r.size} thresholds; give '
-                    f'{"1 to 3 numbers" if name == "curves" else "one number"} each'
+                    f'{each} each'
                 )
             if not np.all(np.isfinite(values)):
                 raise ModelError(f'hysteresis: {name} must be finite numbers')
@@ -216,8 +211,7 @@ class Hysteresis:
         """
         Compute voltages over the span, and the slope of H behind a turn at each; shapes (k,).
 
-        `sweeps` adds the slopes along sweeps between any two of nine voltages, as lags along the
-        path need them.
+        `sweeps` adds slopes between any two of nine voltages: lags along the path need them.
         """
         low, high = self.span
         places = np.linspace(low, high, 129)
@@ -276,27 +270,20 @@ class Hysteresis:
         alive = np.maximum(*ends) > nothing
         if self.curves is not None:
             alive |= np.abs(self.curves).max(axis=1, initial=0.0) > nothing
-        return replace(
-            self,
-            thresholds=self.thresholds[alive],
-            weights=self.weights[alive],
-            curves=None if self.curves is None else self.curves[alive],
-            bias=None if self.bias is None else self.bias[alive],
-        )
+        curves = None if self.curves is None else self.curves[alive]
+        bias = None if self.bias is None else self.bias[alive]
+        r, q = self.thresholds[alive], self.weights[alive]
+        return replace(self, thresholds=r, weights=q, curves=curves, bias=bias)
 
     def scaled(self, gain: float) -> Hysteresis:
         """Multiply H by a gain >= 0."""
-        lags = self.relaxations
-        return replace(
-            self,
-            weights=gain * self.weights,
-            p0=gain * self.p0,
-            p1=gain * self.p1,
-            p2=gain * self.p2,
-            curves=None if self.curves is None else gain * self.curves,
-            bias=None if self.bias is None else gain * self.bias,
-            relaxations=None if lags is None else lags * np.array([1.0, gain, gain, gain]),
-        )
+        scaled: dict[str, Any] = {'p0': gain * self.p0, 'p1': gain * self.p1, 'p2': gain * self.p2}
+        for name in ('weights', 'curves', 'bias', 'relaxations'):
+            if (values := getattr(self, name)) is not None:
+                scaled[name] = gain * values
+        if self.relaxations is not None:
+            scaled['relaxations'][:, 0] = self.relaxations[:, 0]
+        return replace(self, **scaled)
 
     @property
     def numbers(self) -> Array:
@@ -312,12 +299,7 @@ class Hysteresis:
         return initial_memory(v0, self.thresholds)
 
     def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> Array:
-        """
-        Compute w for a normalised input v, shapes (n,).
-
-        The memory, shape (m,) or (m + k,), holds the play outputs before the first sample, and
-        behind them the lags along the path.
-        """
+        """Compute w for a normalised v, shapes (n,), from a memory, shape (m,) or (m + k,)."""
         x = np.asarray(v, dtype=np.float64)
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
         return self.follow(x, start)[0]

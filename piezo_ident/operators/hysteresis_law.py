@@ -4,11 +4,12 @@
 """
 Families (laws) of H that are linear in their coefficients, for given thresholds.
 
-    plays      q_i F_i,  v^3,  v                                     law of the paper, eqs.  (3),
-    (6) square     and v^2 bias       square, and hat_j(r_i) (v - low) (F_i - low),  hat_j(r_i)
-    (high - v) (F_i - low) preisach   square, and hat_j(r_i) times Bernstein polynomials in F_i as
-    densities duhem      preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates
-    any        all of these terms, from which the terms of each law can be selected
+- ``plays``: q_i F_i, v^3 and v, the law of the paper, eqs. (3) and (6).
+- ``square``: plays, and v^2.
+- ``bias``: square, hat_j(r_i) (v - low) (F_i - low), and hat_j(r_i) (high - v) (F_i - low).
+- ``preisach``: square, and hat_j(r_i) times Bernstein polynomials in F_i as densities.
+- ``duhem``: preisach, and lags of v, v^2 and v^3 along the path of v, at a few rates.
+- ``any``: all of these terms, from which the terms of each law can be selected.
 
 hat_j are piecewise linear functions of the threshold on a few even nodes.  All coefficients are >=
 0, except for lags and powers of v.  Every play therefore keeps a weight >= 0 wherever it stands.
@@ -46,23 +47,11 @@ RATES = (1.0, 2.0, 4.0, 8.0, 16.0)
 @dataclass(frozen=True, eq=False)
 class HysteresisLaw:
     """
-    Family of H that is linear in its coefficients.
+    Family of H that is linear in its coefficients; ModelError for an unknown name.
 
-    Parameters
-    ----------
-    name : {'plays', 'square', 'bias', 'preisach', 'duhem', 'any'}
-    thresholds : array_like, shape (m,)
-        Thresholds above zero, ascending, normalised.
-    span : tuple of float, optional
-        Voltages for which the law holds, normalised (`Hysteresis.span`).
+    The thresholds, shape (m,), are above zero and ascending.  The law holds for voltages in the
+    span (`Hysteresis.span`).  Both are normalised.
 
-    Raises
-    ------
-    ModelError
-        If the name is unknown.
-
-    Examples
-    --------
     >>> law = HysteresisLaw('square', [0.25, 0.5])
     >>> law.size, law.lower.tolist()
     (5, [0.0, 0.0, -inf, -inf, -inf])
@@ -103,9 +92,9 @@ class HysteresisLaw:
         """
         Compute rows that measure the densities and their change with the place of a play.
 
-        The product of a row and the coefficients is one in three cases: for a play of the density
-        `density`, for a density `change` that depends on the place, and for a difference `change`
-        of neighbouring coefficients of a polynomial.  The shape is (k, size).
+        The shape is (k, size).  The product of a row and the coefficients is one for a play of the
+        density `density`, or for a density `change` that depends on the place.  It is also one for
+        a difference `change` of neighbouring coefficients of a polynomial.
         """
         m, n = self.thresholds.size, self.densities
         size = np.eye(n, self.size) / change
@@ -169,26 +158,24 @@ class HysteresisLaw:
     def hysteresis(self, coefficients: ArrayLike) -> Hysteresis:
         """Make the H of coefficients, shape (size,); values below their bound are set to it."""
         theta = np.maximum(np.asarray(coefficients, dtype=np.float64), self.lower)
-        return self._of(theta @ self._parameters, self.thresholds)
+        has_curves = self.name in ('preisach', 'duhem', 'any')
+        return self._of(theta @ self._parameters, has_curves, self.name in ('bias', 'any'))
 
-    def _of(self, x: Array, thresholds: Array) -> Hysteresis:
-        n = (POWERS + 2) * thresholds.size
-        plays, (p0, p1, p2) = x[:n].reshape(POWERS + 2, -1), x[n : n + 3]
-        lags = None
-        if self.lags:
-            rates = np.array(RATES) / (self.span[1] - self.span[0])
-            lags = np.column_stack([rates, x[n + 3 :].reshape(-1, 3)])
-        return Hysteresis(
-            thresholds,
-            plays[0],
-            float(p1),
-            float(p2),
-            float(p0),
-            curves=plays[1:-1].T if self.name in ('preisach', 'duhem', 'any') else None,
-            bias=plays[-1] if self.name in ('bias', 'any') else None,
-            span=self.span,
-            relaxations=lags,
-        )
+    def _of(
+        self, row: Array, has_curves: bool, has_bias: bool, plays: Mask | None = None
+    ) -> Hysteresis:
+        """Make the H of a row of parameters; given `plays`, without its other plays and lags."""
+        n = (POWERS + 2) * self.thresholds.size
+        x, (p0, p1, p2) = row[:n].reshape(POWERS + 2, -1), row[n : n + 3].tolist()
+        lags = row[n + 3 :].reshape(-1, 3)
+        rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])
+        relaxations = np.column_stack([rates, lags])
+        r = self.thresholds
+        if plays is not None:
+            r, x, relaxations = r[plays], x[:, plays], relaxations[lags.any(axis=1)]
+        curves, bias = x[1:-1].T if has_curves else None, x[-1] if has_bias else None
+        lagging = relaxations if relaxations.size else None
+        return Hysteresis(r, x[0], p1, p2, p0, curves, bias, self.span, lagging)
 
     def deviations(self, covariance: Array) -> Array:
         """Compute the standard deviations of q_i, p1 and p2 from a covariance, shape (m + 2,)."""
@@ -205,26 +192,11 @@ class HysteresisLaw:
 
     @functools.cached_property
     def _parts(self) -> tuple[tuple[Hysteresis, Mask], ...]:
-        r, m = self.thresholds, self.thresholds.size
-        n = (POWERS + 2) * m
-        parts = []
+        m, parts = self.thresholds.size, []
         for row in self._parameters:
-            plays, (p0, p1, p2) = row[:n].reshape(POWERS + 2, m), row[n : n + 3]
-            moved, lags = plays.any(axis=0), row[n + 3 :].reshape(-1, 3)
-            rates = np.array(RATES[: len(lags)]) / (self.span[1] - self.span[0])
-            chosen = lags.any(axis=1)
-            part = Hysteresis(
-                r[moved],
-                plays[0, moved],
-                float(p1),
-                float(p2),
-                float(p0),
-                curves=plays[1:-1, moved].T if plays[1:-1].any() else None,
-                bias=plays[-1, moved] if plays[-1].any() else None,
-                span=self.span,
-                relaxations=np.column_stack([rates, lags])[chosen] if chosen.any() else None,
-            )
-            parts.append((part, moved))
+            x = row[: (POWERS + 2) * m].reshape(POWERS + 2, m)
+            moved = x.any(axis=0)
+            parts.append((self._of(row, bool(x[1:-1].any()), bool(x[-1].any()), moved), moved))
         return tuple(parts)
 
     @functools.cached_property
@@ -243,9 +215,8 @@ class HysteresisLaw:
         """
         Yield the contribution to H of each coefficient under a normalised v; shapes (n,).
 
-        The memory, shape (m,), holds the play outputs before the first sample; by default these
-        are the outputs of a stage that last came down to zero.  `places` selects coefficients; by
-        default all are computed.
+        The memory, shape (m,), holds the play outputs before the first sample, by default those
+        after a stage came down to zero.  `places` selects coefficients, by default all.
         """
         start = initial_memory(float(v[0]), self.thresholds) if memory is None else memory
         start = np.asarray(start, dtype=np.float64)
@@ -268,11 +239,7 @@ class HysteresisLaw:
         return np.array([*range(m), *range(start, stop), *lags, *powers])
 
     def coefficients(self, hysteresis: Hysteresis) -> Array:
-        """
-        Compute the coefficients of an H of this family, shape (size,).
-
-        Raises ModelError if H has other thresholds or does not belong to this family.
-        """
+        """Compute the coefficients of an H, shape (size,); ModelError for another family."""
         h, m = hysteresis, self.thresholds.size
         if not np.array_equal(h.thresholds, self.thresholds):
             raise ModelError('hysteresis: the law has other thresholds')
@@ -286,7 +253,7 @@ class HysteresisLaw:
         if h.relaxations is not None:
             rates = np.array(RATES) / (self.span[1] - self.span[0])
             if not self.lags or not np.array_equal(h.relaxations[:, 0], rates):
-                raise ModelError(f'hysteresis: this H is none of the law {self.name!r}')
+                raise ModelError(f'hysteresis: this H does not belong to the law {self.name!r}')
             lags = h.relaxations[:, 1:].ravel()
         wanted = np.concatenate([plays.ravel(), [h.p0, h.p1, h.p2], lags])
         theta = np.zeros(self.size)
@@ -297,7 +264,7 @@ class HysteresisLaw:
         if plays[1:].any():
             theta = lsq_linear(self._parameters.T, wanted, (self.lower, np.inf), method='bvls').x
         if not np.allclose(theta @ self._parameters, wanted, rtol=1e-6, atol=1e-9):
-            raise ModelError(f'hysteresis: this H is none of the law {self.name!r}')
+            raise ModelError(f'hysteresis: this H does not belong to the law {self.name!r}')
         return theta
 
 

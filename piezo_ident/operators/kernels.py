@@ -5,8 +5,10 @@
 Compiled loops of H, of G, and of H, G and the delay together.
 
     F_r[v](k) = max(v(k) - r, min(v(k), F_r[v](k-1)))                                  (eqs. 1-2)
+
     w(k) = p1 v(k)^3 + p2 v(k) + sum_i q_i F_ri[v](k)                                 (eqs. 3, 6)
            [+ p0 v(k)^2 + sum_i psi_i(F_ri[v](k)) + kappa_i (v(k) - low) (F_ri[v](k) - low)]
+
     y(k) = sum_{j=1..nb} b_j w(k-j+1) - sum_{i=1..na} a_i y(k-i)                      (eqs. 4-5)
 
 of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868; the terms in brackets are explained
@@ -91,11 +93,7 @@ def wide_hysteresis(
     memory: Array,
     out: Array,
 ) -> None:
-    """
-    Write w as `hysteresis` does, with the terms in brackets of the equations above.
-
-    The rows of c, shape (5, m), are c_1 .. c_3 of `curve`, kappa, and the widths.
-    """
+    """Write w with the terms in brackets; rows of c, shape (5, m): c_1 .. c_3, kappa, width."""
     for k in range(v.size):
         x, w = v[k], 0.0
         for i in range(r.size):
@@ -172,9 +170,8 @@ def dynamics(w: Array, b: Array, a: Array, y: Array) -> None:
     """
     Continue y by eqs. (4) and (5), without the delay.
 
-    w, shape (nb - 1 + n,), begins with the earlier samples, and y, shape (na + n,), with the
-    earlier outputs.  The coefficients b_nb .. b_1 and a_na .. a_1 run from the oldest sample to
-    the newest.
+    w, shape (nb - 1 + n,), and y, shape (na + n,), begin with earlier samples and outputs.  The
+    coefficients b_nb .. b_1 and a_na .. a_1 run from the oldest sample to the newest.
     """
     nb, na = b.size, a.size
     for start in range(0, y.size - na, STRETCH):
@@ -274,26 +271,12 @@ def cascade(
     out: Array,
 ) -> None:
     """
-    Pass a voltage through H, G and the delay, and update their states.
+    Pass a voltage v [V] through H, G and the delay to `out` [m], shapes (n,).
 
-    Parameters
-    ----------
-    v, out : ndarray, shape (n,)
-        Voltage [V] and displacement [m].
-    scale : ndarray, shape (4,)
-        v0, V, y0 and Y.
-    r, q, p1, p2, p0, low, c, lags
-        As in `wide_hysteresis` and `relaxing`; as in `hysteresis` if c has no rows.
-    memory : ndarray
-        Memory of the plays, shape (m,), and behind it the memory of the lags.
-    b, a
-        As in `dynamics`.
-    w : ndarray, shape (nb - 1 + k,)
-        Last outputs of H, and room for k new outputs.
-    y : ndarray, shape (past + k,), past >= na, past > d
-        Last outputs of G, and room for k new outputs.
-    d, fraction : int and float
-        Delay [samples].
+    `scale` is v0, V, y0 and Y.  Without rows of c, H is `hysteresis`, else `wide_hysteresis`; the
+    `lags` are the rows of `relaxing`.  The memory of H holds its plays, then its lags.  The delay
+    is d samples and a fraction.  w, shape (nb - 1 + k,), and y, shape (past + k,), hold the last
+    outputs of H and G, and room for k new ones.  `past` is at least na, and above d.
     """
     v0, V, y0, Y = scale[0], scale[1], scale[2], scale[3]
     past_w = b.size - 1

@@ -50,10 +50,9 @@ def is_single_play(h: Hysteresis) -> bool:
 
 def weights_of(group: list[Part]) -> tuple[Array, Array]:
     """
-    Collect weights and curves of a group as `four_sums` takes them.
+    Collect the weights, shape (`SIDE_BY_SIDE`, m), and curves of a group for `four_sums`.
 
-    Their shapes are (`SIDE_BY_SIDE`, m) and (`SIDE_BY_SIDE`, 5, m), where m includes idle plays.
-    A missing part has zero weights.
+    m includes idle plays; a missing part has zero weights.
     """
     r, *_, c = group[0][0].for_kernel
     q, curves = np.zeros((SIDE_BY_SIDE, r.size)), np.zeros((SIDE_BY_SIDE, *c.shape))
@@ -70,8 +69,6 @@ def columns_of_parts(
 
     Lags along the path begin as `Hysteresis.settled` at `rest`, by default at the first input.
 
-    Examples
-    --------
     >>> parts = [(Hysteresis([0.5], [q], 0.0, 0.0), np.zeros(1)) for q in (1.0, 2.0)]
     >>> [column.tolist() for column in columns_of_parts(np.array([0.0, 1.0]), parts)]
     [[0.0, 0.5], [0.0, 1.0]]
@@ -118,8 +115,8 @@ def four_sums(low: float, q: Array, c: Array, memory: Array) -> tuple[float, flo
     """
     Compute ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
 
-    psi is `piezo_ident.operators.kernels.curve`; q and c come from `weights_of`.  A kernel of
-    another file keeps the version of this function at the last change of its own file.
+    psi is `piezo_ident.operators.kernels.curve`; q and c come from `weights_of`.  A kernel keeps
+    the version of this function at the last change of its own file.
     """
     # the sums are written out, so that the loop over plays vectorises
     s_0, s_1, s_2, s_3 = 0.0, 0.0, 0.0, 0.0

@@ -31,23 +31,11 @@ def initial_memory(v0: float, thresholds: ArrayLike) -> Array:
 
 def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None = None) -> Array:
     """
-    Compute the output of every play operator.
+    Compute the outputs of plays, shape (m, n), for a normalised input, shape (n,).
 
-    Parameters
-    ----------
-    v : array_like, shape (n,)
-        Normalised input.
-    thresholds : array_like, shape (m,)
-        Thresholds r >= 0.
-    memory : array_like, shape (m,), optional
-        Outputs before the first sample; by default `initial_memory` of the first input.
+    The thresholds, shape (m,), are >= 0.  The memory, shape (m,), are the outputs before the first
+    sample; by default `initial_memory` of the first input.
 
-    Returns
-    -------
-    ndarray, shape (m, n)
-
-    Examples
-    --------
     >>> play_columns([0.0, 1.0, 0.0], [0.25]).tolist()
     [[0.0, 0.75, 0.0]]
     """

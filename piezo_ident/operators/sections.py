@@ -4,7 +4,7 @@
 """
 Run G as a cascade of second-order sections if eq. (5) would lose digits.
 
-Each output of eq.  (5) is rounded, and the rounding error passes through 1/A like noise.  A G with
+Each output of eq. (5) is rounded, and the rounding error passes through 1/A like noise.  A G with
 many lightly damped modes amplifies it to 1e-10 of the stroke.  The rounding error of a section
 only passes through two poles and the sections behind it: the same G then keeps 1e-13.
 """
@@ -32,7 +32,7 @@ def rounding_of(a: Array) -> float:
     """
     Estimate the rms rounding error of eq. (5) as a share of its output.
 
-    It is the rounding of one output times the rms gain of 1/A.  This gain is the product of
+    The error is the rounding of one output times the rms gain of 1/A.  This gain is the product of
     1 / sqrt(1 - k^2) over its reflection coefficients k; infinite for an unstable G.
     """
     size, power, rest = 1.0 + float(a @ a), 1.0, a
@@ -48,10 +48,9 @@ def rounding_of(a: Array) -> float:
 
 def sections_of(a: Array, b: Array, gain: float) -> Array | None:
     """
-    Factor G into sections; None if eq. (5) is accurate enough.
+    Factor G into sections with rows b_0, b_1, b_2, a_1, a_2; None if eq. (5) is accurate enough.
 
-    A row of the sections, shape (n, 5), holds b_0, b_1, b_2, a_1 and a_2.  The sections keep the
-    static gain to the last digit.
+    The sections, shape (n, 5), keep the static gain to the last digit.
     """
     begins = abs(b[0]) > NOTHING * np.abs(b).max()
     if not begins or not math.isfinite(gain) or not LOST < rounding_of(a) < math.inf:

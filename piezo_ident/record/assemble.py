@@ -5,9 +5,9 @@
 Raw columns to a record: every fault of measured data is met here, the same way for all formats.
 
 Gaps, restarts and changes of the sampling rate split the record.  Repeated rows are dropped.
-Samples without a number are cut out; where only the displacement has none, the voltage stays.
-Each of these is reported as a `Fault`.  Data that would need a guess are refused, and the message
-says what to do.
+Samples without a number are cut out; the voltage of a sample stays if only the displacement is no
+number.  A `Fault` reports each of these.  Data that need a guess are refused, and the message says
+what to do.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from piezo_ident.record.options import ReadOptions, split_unit, unit_factor, UNI
 from piezo_ident.record.ordering import at_times, in_order, not_uniform, OrderedRows, unrounded
 from piezo_ident.record.record import Fault, Piece, Record, Segment
 
-#: label of each stretch and the row at which it begins; it lasts until the next begins
+#: label of each stretch, and the row at which it begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
 
 #: higher rates [Hz] are counted in another unit than seconds
@@ -35,9 +35,7 @@ MAX_RATE = 1e9
 PIECES = 10_000
 #: more pieces than this, with fewer samples than this in each, are no uniform sampling
 MANY = 10
-#: a stretch of fewer samples has no sampling rate
-MIN_PIECE = 2
-#: pieces of fewer samples may tell a rate of their own; so many such rates come from no clock
+#: a piece of fewer samples may tell a rate of its own; more such rates come from no clock
 FEW, MOST_RATES = 32, 3
 #: strokes of piezo stages [m]; anything else is the wrong unit
 STROKE = (1e-9, 10e-3)
@@ -81,35 +79,14 @@ def assemble(
     faults: Iterable[Fault] = (),
 ) -> Record:
     """
-    Make a record of raw columns.
+    Make a record in SI units of raw columns: time [s], voltage [V] and displacement, shape (n,).
 
-    Parameters
-    ----------
-    t, v, y : array_like, shape (n,)
-        Time [s], command voltage [V] and displacement [``options.displacement_unit``]; NaN in
-        the record where `v` or `y` is None.
-    segments : tuple of (names, starts), optional
-        Label of each stretch and the row at which it begins; an empty label means none.
-    channels : mapping of str to array_like, shape (n,), optional
-        Further signals; ``v_<name>`` and ``y_<name>`` are another axis.
-    name : str
-        Name of the record, also in errors.
-    options : ReadOptions, optional
-        Unit of `y`, and limits of `v`; they hold for further axes too.
-    sample_rate : float, optional
-        Rate that the file names [Hz]; the stamps must agree with it.
-    faults : iterable of Fault
-        Already met by the caller.
-
-    Returns
-    -------
-    Record
-        Its pieces carry SI units; its faults say what was met and done.
-
-    Raises
-    ------
-    DataError
-        For data that cannot be used without a guess.
+    `v` or `y` become NaN if they are None.  `segments` are the label of each stretch and the row
+    at which it begins; an empty label means none.  `channels` are further signals, ``v_<name>``
+    and ``y_<name>`` those of another axis.  The unit of `y` and the limits of `v` in the `options`
+    hold for further axes too.  The stamps must agree with the `sample_rate` [Hz] that a file
+    names.  The record takes over `faults` that the caller met.  DataError for data that cannot be
+    used without a guess.
     """
     options = options or ReadOptions()
     met = list(faults)
@@ -154,20 +131,16 @@ def _table(
         lengths = ', '.join(f'{k} {"x".join(map(str, s))}' for k, s in shapes.items())
         raise DataError(f'{name}: columns differ in length ({lengths}); give one value a sample')
     n = columns['t'].size
-    if n == 0:
-        raise DataError(f'{name}: no samples; record some')
-    if n == 1:
-        raise DataError(f'{name}: one sample only; a record needs at least two')
+    if n < 2:
+        found = 'one sample only' if n else 'no samples'
+        raise DataError(f'{name}: {found}; a record needs at least two')
     names, starts = segments if segments is not None else ((), ())
     try:
         rows = np.asarray(starts if len(names) else (), dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise DataError(f'{name}: segment starts must be sample indices') from None
-    if (
-        rows.size != len(names)
-        or not np.all((rows >= 0) & (rows <= n) & (rows == np.floor(rows)))
-        or np.any(np.diff(rows) < 0)
-    ):
+        rows = np.array([np.nan])
+    inside = np.all((rows >= 0) & (rows <= n) & (rows == np.floor(rows)))
+    if rows.size != len(names) or not inside or np.any(np.diff(rows) < 0):
         raise DataError(
             f'{name}: segments need one start for each name, rising sample indices from 0 to {n}'
         )
@@ -176,11 +149,9 @@ def _table(
 
 
 def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> OrderedRows:
-    """Drop rows without a number; where only y has none it is NaN, and the row stays."""
-    finite = np.isfinite(table.t)
-    for key, x in table.columns.items():
-        if key != 'y':
-            finite &= np.isfinite(x)
+    """Drop rows without a number; a row that lacks y alone stays, with NaN."""
+    others = (x for key, x in table.columns.items() if key != 'y')
+    finite = np.logical_and.reduce([np.isfinite(x) for x in (table.t, *others)])
     y = table.columns.get('y', table.t)
     unmeasured = finite & ~np.isfinite(y)
     bad = finite.size - int(np.count_nonzero(finite))
@@ -211,9 +182,7 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
 
 
 def _check_limits(table: OrderedRows, limits: tuple[float, float] | None, name: str) -> None:
-    if limits is None:
-        return
-    low, high = limits
+    low, high = limits or (-np.inf, np.inf)
     for key, v in table.columns.items():
         if (key != 'v' and role_of(key) != 'v') or (low <= v.min() and v.max() <= high):
             continue
@@ -291,8 +260,9 @@ def _pieces(
         raise DataError(
             f'{name}: {len(parts)} breaks in time, at most {PIECES} can be met; cut the file'
         )
-    short = [p[0] for p in parts if p[1] - p[0] < MIN_PIECE]
-    parts = [p for p in parts if p[1] - p[0] >= MIN_PIECE]
+    # a lone sample has no sampling rate
+    short = [a for a, b in parts if b - a < 2]
+    parts = [(a, b) for a, b in parts if b - a >= 2]
     if not parts:
         raise DataError(f'{name}: no two samples belong together; check the time column')
     y = table.columns.get('y', t)
@@ -302,12 +272,11 @@ def _pieces(
     if short:
         met.append(Fault('lone_sample', at_times(np.sort(t[short])), len(short), 'dropped'))
     clocks = _clocks(t, parts, resolution, name, sample_rate, met)
-    rates: dict[bool, set[float]] = {True: set(), False: set()}
-    for (start, stop), clock in zip(parts, clocks, strict=True):
-        rates[stop - start < FEW].add(clock.sample_rate)
-    if len(rates[True] - rates[False]) > MOST_RATES:
+    rates = [clock.sample_rate for clock in clocks]
+    long = {rate for rate, (a, b) in zip(rates, parts, strict=True) if b - a >= FEW}
+    if len({*rates} - long) > MOST_RATES:
         raise not_uniform(t, len(parts), name)
-    _report_breaks(table, epochs, parts, clocks, met)
+    _report_breaks(table, epochs, parts, rates, met)
     pieces = [_piece(table, p, c) for p, c in zip(parts, clocks, strict=True)]
     if 'y' not in table.columns:
         return tuple(pieces)
@@ -349,38 +318,37 @@ def _report_breaks(
     table: OrderedRows,
     epochs: list[int],
     parts: list[tuple[int, int]],
-    clocks: list[Clock],
+    rates: list[float],
     met: list[Fault],
 ) -> None:
     gaps, lost, changes = [], 0.0, []
-    known = {*epochs, *table.torn.tolist()}
-    for i in range(1, len(parts)):
-        end, start = parts[i - 1][1] - 1, parts[i][0]
-        old, new = clocks[i - 1], clocks[i]
-        if not known.isdisjoint(range(end + 1, start + 1)):
-            continue  # reported as what it is
+    reported = {*epochs, *table.torn.tolist()}
+    for (old, new), (one, other) in zip(
+        itertools.pairwise(rates), itertools.pairwise(parts), strict=True
+    ):
+        end, start = one[1] - 1, other[0]
+        if not reported.isdisjoint(range(end + 1, start + 1)):
+            continue
         step = table.t[start] - table.t[end]
-        if old.sample_rate != new.sample_rate:
+        if old != new:
             changes.append(float(table.t[start]))
-        if old.sample_rate == new.sample_rate or step > 1.5 * max(
-            1 / old.sample_rate, 1 / new.sample_rate
-        ):
+        if old == new or step > 1.5 / min(old, new):
             gaps.append(float(table.t[end]))
-            lost += float(step) - 1 / old.sample_rate
+            lost += float(step) - 1 / old
     if gaps:
         where = f'{at_times(np.array(gaps))}, {lost:.3g} s in all'
         met.append(Fault('gap', where, len(gaps), 'record split there'))
     if changes:
-        rates = ', '.join(f'{r:g}' for r in dict.fromkeys(c.sample_rate for c in clocks))
-        where = f'{at_times(np.array(changes))}, between {rates} Hz'
+        text = ', '.join(f'{rate:g}' for rate in dict.fromkeys(rates))
+        where = f'{at_times(np.array(changes))}, between {text} Hz'
         met.append(Fault('rate_change', where, len(changes), 'record split there'))
 
 
 def _piece(table: OrderedRows, part: tuple[int, int], clock: Clock) -> Piece:
     start, stop = part
     columns = {k: x[start:stop] for k, x in table.columns.items()}
-    starts = table.starts
     segments: list[Segment] = []
+    starts = table.starts
     low = max(int(np.searchsorted(starts, start, 'right')) - 1, 0)
     for i in range(low, int(np.searchsorted(starts, stop))):
         end = int(starts[i + 1]) if i + 1 < starts.size else stop

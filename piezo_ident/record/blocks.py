@@ -9,9 +9,9 @@ A block is an N x 2 matrix, row by row::
     dim[0] = {label 'sample:<segment>', size N, stride 2N}
     dim[1] = {label 't,<quantity>',     size 2, stride 2}
 
-so that a block explains itself: when its samples were taken, what they are, to which segment
-they belong.  The quantity is ``voltage``, ``displacement``, ``voltage_<name>`` or
-``displacement_<name>`` for a further axis, or ``x_<name>`` for a further channel.
+A block thus explains itself: the times, quantity and segment of its samples.  The quantity is
+``voltage``, ``displacement``, ``voltage_<name>`` or ``displacement_<name>`` for a further axis, or
+``x_<name>`` for a further channel.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from piezo_ident.record.record import Segment
 
 #: samples in a block by default
 BLOCK_SIZE = 100
-#: labels of voltages that a driver applies without a command: the last voltage during a gap, and a
-#: ramp to rest when no command comes
+#: labels of voltages without a command: a driver holds the last voltage during a gap, and ramps
+#: to rest when no command comes
 HELD, RAMPED = 'hold:gap', 'ramp:silence'
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5
 #: shortest sampling period of a block [s]: 10 MHz is the highest rate of a node; largest time [s]:
 #: 300 years, where a double still resolves 2 us
 SHORTEST, LATEST = 1e-7, 1e10
-#: a longest step of so many shortest ones is that of a sample that is missing, not jitter (taste)
+#: a longest step of so many shortest ones means a missing sample, not jitter (taste)
 UNEVEN = 1.5
 
 
@@ -50,11 +50,7 @@ class Dimension(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """
-    A block of samples of one quantity: time [s] and values [SI], shapes (n,).
-
-    The label of the segment is empty for none.
-    """
+    """A block of one quantity: times [s], values [SI], shapes (n,), and label of its segment."""
 
     t: Array
     values: Array
@@ -63,7 +59,7 @@ class Samples:
 
     @property
     def not_finite(self) -> int:
-        """How many values are no numbers."""
+        """Number of values that are NaN or infinite."""
         return int(np.count_nonzero(~np.isfinite(self.values)))
 
 
@@ -86,7 +82,7 @@ def encode(samples: Samples) -> tuple[Array, tuple[Dimension, Dimension]]:
 
 
 def quantity_of(dims: Sequence[Any]) -> str | None:
-    """Return the quantity that a layout names, None for the layout of another message."""
+    """Return the quantity of a layout, None for the layout of another message."""
     if len(dims) != 2 or not dims[1].label.startswith('t,'):
         return None
     return str(dims[1].label)[2:].strip()
@@ -96,9 +92,9 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
     """
     Return the samples of a block, from the numbers of its message, shape (2 n,), and their layout.
 
-    The numbers are not copied; `data_offset` is how many stand in front of the matrix.  Times of
-    the ticks of a whole rate are k / rate, or streams would not meet on them: k times the period
-    is another number.  DataError when the layout is not that of a block, or does not fit the data.
+    The numbers are not copied; `data_offset` of them stand in front of the matrix.  Ticks of a
+    whole rate become k / rate, so that streams meet on them: k times the period is another number.
+    DataError for another layout than that of a block, or for a layout that does not fit the data.
     """
     flat = np.asarray(data, dtype=np.float64)
     quantity = quantity_of(dims)
@@ -124,7 +120,7 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
 @np.errstate(over='ignore', invalid='ignore')
 def time_problem(t: Array) -> str:
     """
-    Return why the time stamps of a block [s] are not those of samples in a row, empty otherwise.
+    Return the reason why time stamps [s] are no samples in a row, empty if they are.
 
     >>> time_problem(np.array([0.0, 0.1, 0.2])), time_problem(np.array([0.0, np.nan]))
     ('', 'its time stamps are not finite, or more than 1e+10 s from zero')
@@ -138,17 +134,15 @@ def time_problem(t: Array) -> str:
     low, high = (float(step.min()), float(step.max())) if step.size else (1.0, 1.0)
     if 0.999 * SHORTEST < low and high < UNEVEN * low:
         return ''
-    return (
-        f'its time stamps are not ticks of one rate in a row: steps of {low:.6g} to {high:.6g} s'
-    )
+    return f'its time stamps are not ticks of one rate: steps of {low:.6g} to {high:.6g} s'
 
 
 @np.errstate(over='ignore', invalid='ignore')
 def _on_ticks(t: Array) -> Array:
-    """Return times as ticks over their rate, where they are that but for rounding."""
+    """Return times that are ticks but for rounding as ticks over their rate."""
     span = float(t[-1] - t[0]) if t.size > 1 else 0.0
     rate = (t.size - 1) / span if 0.0 < span < np.inf else 0.0
-    # times that are no numbers, or jump, are for others to meet
+    # times that are no numbers, or jump, are met elsewhere
     if not 1.0 <= rate < 1e9 or abs(rate / round(rate) - 1.0) > ROUNDING:
         return t
     exact: Array = np.rint(t * round(rate)) / round(rate)

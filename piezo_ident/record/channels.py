@@ -4,9 +4,8 @@
 """
 Channels of a stage with several axes, and their names in each format.
 
-The first axis is ``v`` and ``y``, as of any stage.  The voltage and the displacement of another
-one are the channels ``v_<name>`` and ``y_<name>``; whatever looks at one axis takes them for
-further channels.
+The first axis is ``v`` and ``y``, as of any stage.  Voltage and displacement of another axis are
+the channels ``v_<name>`` and ``y_<name>``.  Code for one axis takes them for further channels.
 
 | channel | column of a table | topic, and quantity of its blocks |
 |---|---|---|
@@ -27,7 +26,7 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.record.options import plain_unit, UNITS
 from piezo_ident.record.record import Piece, Record
 
-#: what the amplifier of the first axis got; of another one with its name behind it
+#: topic with the voltage that the amplifier of the first axis applied
 APPLIED = 'applied_voltage'
 _QUANTITIES = {'v': 'voltage', 'y': 'displacement'}
 _AXIS = re.compile(r'([vy])_(\w{1,60})', re.ASCII)
@@ -35,19 +34,15 @@ _AXIS = re.compile(r'([vy])_(\w{1,60})', re.ASCII)
 
 def role_of(channel: str) -> str:
     """
-    Return what a channel is of another axis: ``v``, ``y``, or nothing.
-
-    A unit is no name of an axis.
+    Return ``v`` or ``y`` for a channel of another axis, else nothing; no unit names an axis.
 
     >>> [role_of(x) for x in ('v_b', 'y_tilt', 'temperature', 'y_um', 'v')]
     ['v', 'y', '', '', '']
     """
     found = _AXIS.fullmatch(channel)
-    if found is None:
-        return ''
-    unit = plain_unit(found[2])
+    unit = plain_unit(found[2]) if found else ''
     is_unit = unit != 'min' and any(unit in units for units in UNITS.values())
-    return '' if is_unit else found[1]
+    return '' if found is None or is_unit else found[1]
 
 
 def column_of(channel: str) -> str:
@@ -57,7 +52,7 @@ def column_of(channel: str) -> str:
 
 def channel_of_column(column: str) -> str:
     """
-    Return the channel in a column, empty for a column that is none.
+    Return the channel in a column, empty for a column without a channel.
 
     >>> [channel_of_column(x) for x in ('v_b', 'x_heat', 'v', 'offset')]
     ['v_b', 'heat', '', '']
@@ -69,7 +64,7 @@ def channel_of_column(column: str) -> str:
 
 def quantity_of_channel(channel: str) -> str:
     """
-    Return what the blocks of a channel are called, which is the name of their topic too.
+    Return the quantity of the blocks of a channel, which is the name of their topic too.
 
     >>> [quantity_of_channel(x) for x in ('v_b', 'y_b', 'heat')]
     ['voltage_b', 'displacement_b', 'x_heat']
@@ -80,7 +75,7 @@ def quantity_of_channel(channel: str) -> str:
 
 def channel_of_quantity(quantity: str) -> str:
     """
-    Return the channel that blocks carry, empty where they carry none.
+    Return the channel that blocks carry, empty for blocks of the first axis.
 
     >>> [channel_of_quantity(x) for x in ('voltage_b', 'x_heat', 'voltage', 'prediction')]
     ['v_b', 'heat', '', '']
@@ -93,7 +88,7 @@ def channel_of_quantity(quantity: str) -> str:
 
 def applied_key(quantity: str) -> str:
     """
-    Return the topic with the output of the amplifier for a voltage, empty for other quantities.
+    Return the topic with the applied voltage for a voltage, empty for other quantities.
 
     >>> [applied_key(x) for x in ('voltage', 'voltage_b', 'displacement', 'x_heat')]
     ['applied_voltage', 'applied_voltage_b', '', '']
@@ -112,9 +107,9 @@ class Axes:
     inputs : ndarray, shape (n, m)
         Command voltages [V].
     outputs : ndarray, shape (n, p)
-        Displacements [m], NaN where a reading was left out.
+        Displacements [m], NaN for readings that were left out.
     input_names, output_names : tuple of str
-        The columns that they are: the first axis before the others, these by their names.
+        Names of the columns: the first axis, then the others in alphabetical order.
     sample_rate : float
         [Hz]
 
@@ -140,14 +135,12 @@ class Axes:
     @classmethod
     def of(cls, piece: Piece) -> Axes:
         """
-        Return the axes of a piece; a piece with one axis gives one column each.
-
-        Inputs and outputs may differ in number.
+        Return the axes of a piece; inputs and outputs may differ in number.
 
         Raises
         ------
         DataError
-            Where a voltage is not known, or nothing of a displacement.
+            If a sample of a voltage is unknown, or all of a displacement.
         """
         columns = {'v': piece.v, 'y': piece.measured, **piece.channels}
         names = {
@@ -172,7 +165,7 @@ class Axes:
         Raises
         ------
         DataError
-            Where the pieces do not carry the same axes, or are not sampled alike.
+            If the pieces do not carry the same axes, or are not sampled alike.
         """
         found: list[Axes] = []
         for record in records:

@@ -5,10 +5,9 @@
 The sampling clock behind a column of time stamps.
 
 Stamps are rounded: to the decimals or digits that a file prints, to single precision, or to the
-last bit.  So a stamp is an interval, and a stretch of stamps is uniform when one rate passes
-through all its intervals.  Among the rates that do, the one with the fewest digits is taken: a
-sampling clock is 5000 Hz, not 4999.9999999997 Hz, and the choice stays the same when the record
-is written and read again.
+last bit.  A stamp is therefore an interval.  A stretch of stamps is uniform if one rate passes
+through all its intervals.  The rate with the fewest digits is taken: a sampling clock is 5000 Hz,
+not 4999.9999999997 Hz, and the choice stays the same when the record is written and read again.
 
 A computer that stamps samples as they arrive is late by a little here and there.  Steps between
 neighbours then look like gaps and changes of rate, but the next step takes each of them back: the
@@ -20,39 +19,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
+from piezo_ident.common.arrays import Array, CHUNK, Integers, Mask, true_runs
 
-#: rows looked at together, so that temporaries stay small beside a long record
-_CHUNK = 1 << 20
 #: a clock that goes back by more samples than this (ten blocks) has restarted
 JUMP_BACK = 1000
 #: fewer steps than this between two finer runs are gaps, not a slower sampling rate
 _SHORT = 8
 #: deviation from the uniform grid, in samples, that is not worth a notice
 _NEGLIGIBLE = 0.01
-#: fewer stamps tell no scatter from a change
+#: fewer stamps cannot tell scatter from a change of rate
 _LEAST = 16
 #: steps on either side over which time is averaged, so that scatter goes and a lost sample stays
 _AROUND = 8
 
 
-@dataclass(frozen=True)
-class Clock:
-    """
-    Uniform time ``start_time + k / sample_rate``.
-
-    Attributes
-    ----------
-    sample_rate : float
-        [Hz].
-    start_time : float
-        Time of the first sample [s].
-    jitter : float
-        Largest deviation of a stamp from the grid beyond the stamps' own rounding, in samples.
-    """
+class Clock(NamedTuple):
+    """Time ``start_time + k / sample_rate`` [s], and how far stamps stray from it [samples]."""
 
     sample_rate: float
     start_time: float
@@ -85,8 +71,8 @@ class Resolution:
             single = bool(np.all(x.astype(np.float32).astype(np.float64) == x))
         return cls(next(decimals, None), next(digits, None), single)
 
-    def half(self, t: Array) -> Array:
-        """Return how far each stamp can lie from the true time by rounding alone [s]."""
+    def error(self, t: Array, dt: float) -> Array:
+        """Return how far each stamp may lie from the true time of its sample, `dt` apart [s]."""
         half = np.zeros(t.shape)
         if self.decimals is not None:
             half += 0.5 * 10.0**-self.decimals
@@ -95,7 +81,8 @@ class Resolution:
             half = np.maximum(half, 0.5 * 10.0 ** (place - self.digits + 1))
         if self.single:
             half = np.maximum(half, 0.5 * np.spacing(np.abs(t).astype(np.float32)))
-        return half
+        # steps of one or two units of the last decimal are exact more often than rounded
+        return np.asarray(np.minimum(half, 0.2 * dt) + 8 * np.spacing(np.abs(t)))
 
 
 def _rounded_to(x: Array, decimals: NDArray[np.int_]) -> bool:
@@ -108,8 +95,8 @@ def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) ->
     """
     Return the times of samples `start` to ``stop - 1`` [s].
 
-    ``k / sample_rate`` in one division where the first sample lies on a tick of the sample clock,
-    so that two streams of the same clock join on equal numbers.
+    The times are ``k / sample_rate`` in one division if the first sample lies on a tick of the
+    sample clock: two streams of one clock then join on equal numbers.
     """
     first = round(start_time * sample_rate)
     t = np.arange(start, stop, dtype=np.float64)
@@ -125,84 +112,74 @@ def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) ->
 
 def split_uniform(t: Array, resolution: Resolution) -> list[tuple[int, int]]:
     """
-    Split strictly increasing stamps [s] where sampling is interrupted or changes its rate.
+    Split strictly increasing stamps [s] at interruptions and at changes of the sampling rate.
 
     Returns (start, stop) of each stretch in order; a stretch may be a single sample.
     """
     cuts = _without_scatter(t, np.flatnonzero(_breaks(t)) + 1)
-    bounds = [0, *cuts.tolist(), t.size]
-    todo = list(itertools.pairwise(bounds))[::-1]
+    todo = list(itertools.pairwise([0, *cuts.tolist(), t.size]))[::-1]
     if cuts.size > t.size // _SHORT + 10:
-        return todo[::-1]  # nothing is uniform here; no closer look will help
+        return todo[::-1]  # no closer look will find a uniform stretch here
     done: list[tuple[int, int]] = []
     while todo:
         start, stop = todo.pop()
-        inner = _inner_cuts(t[start:stop], resolution)
+        inner = [start + c for c in _inner_cuts(t[start:stop], resolution)]
         if inner:
-            marks = [start, *(start + c for c in inner), stop]
-            todo.extend(list(itertools.pairwise(marks))[::-1])
+            todo.extend(list(itertools.pairwise([start, *inner, stop]))[::-1])
         else:
             done.append((start, stop))
     return done
 
 
+def _steps(t: Array, overlap: int) -> Iterator[tuple[int, Array]]:
+    """Yield the steps of `t` chunk by chunk, and the sample before the first of them."""
+    for i in range(0, t.size - overlap, CHUNK):
+        yield i, np.diff(t[i : i + CHUNK + overlap])
+
+
 def _breaks(t: Array) -> Mask:
     """
-    Tell for each step between neighbours whether it lies outside every uniform stretch.
+    Return for each step between neighbours whether it lies outside every uniform stretch.
 
-    Steps of like size form runs.  A short run of coarse steps beside a finer one is a gap; where
-    two proper runs meet the rate changes, and the sample between them goes to the later one.
+    Steps of like size form runs.  A short run of coarse steps beside a finer run is a gap.  The
+    rate changes between two longer runs, and the sample between them goes to the later run.
     """
     n = t.size - 1
-    if n < 2:
+    runs: list[int] = [0]
+    for i, step in _steps(t, 2):
+        change = np.abs(np.diff(step)) > 0.6 * np.minimum(step[1:], step[:-1])
+        runs += (np.flatnonzero(change) + (i + 1)).tolist()
+    if len(runs) == 1:
         return np.zeros(max(n, 0), dtype=np.bool_)
-    first = np.array([0, *itertools.chain.from_iterable(_changes(t))])
-    if first.size == 1:
-        return np.zeros(n, dtype=np.bool_)
+    first = np.array(runs)
     length = np.diff(np.append(first, n))
     level = (t[first + length] - t[first]) / length
-    before = np.concatenate([[np.inf], level[:-1]])
-    after = np.concatenate([level[1:], [np.inf]])
+    before, after = np.append(np.inf, level[:-1]), np.append(level[1:], np.inf)
     gap = (length < _SHORT) & (level > 1.5 * np.minimum(before, after))
     breaks = np.repeat(gap, length)
-    meet = ~gap[1:] & ~gap[:-1]
-    breaks[first[1:][meet] - 1] = True
+    breaks[first[1:][~gap[1:] & ~gap[:-1]] - 1] = True
     return breaks
 
 
-def _changes(t: Array) -> Iterator[list[int]]:
-    """Yield, chunk by chunk, the steps that differ from the one before them."""
-    for i in range(0, t.size - 2, _CHUNK):
-        step = np.diff(t[i : i + _CHUNK + 2])
-        change = np.abs(np.diff(step)) > 0.6 * np.minimum(step[1:], step[:-1])
-        yield (np.flatnonzero(change) + (i + 1)).tolist()
-
-
-def _wide(t: Array, least: float) -> list[int]:
-    """Return the samples behind steps of more than a size."""
-    wide: list[int] = []
-    for i in range(0, t.size - 1, _CHUNK):
-        wide.extend((np.flatnonzero(np.diff(t[i : i + _CHUNK + 1]) > least) + (i + 1)).tolist())
-    return wide
-
-
 def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
-    """Return where a stretch without coarse breaks must still be cut; empty when uniform."""
+    """Return the cuts that a stretch without coarse breaks still needs; empty if uniform."""
     n = t.size
     if n < 3:
         return []
     dt = (t[-1] - t[0]) / (n - 1)
     # rounding to a few decimals can hide a missing sample from a look at neighbours only
-    wide = _wide(t, 1.5 * dt)
+    wide: list[int] = []
+    for i, step in _steps(t, 1):
+        wide += (np.flatnonzero(step > 1.5 * dt) + (i + 1)).tolist()
     if wide and not _scatters(t):
         return wide
-    low, high = rate_bounds(t, _rounding(resolution, dt))
+    low, high = rate_bounds(t, lambda x: resolution.error(x, dt))
     if low <= high:
         return []
-    residual = _residual_of(t)
+    residual = _line_residual(t)
     if np.abs(residual).max() <= _NEGLIGIBLE * dt or n < 4 * _SHORT or _scatters(t):
         return []
-    # a change of rate is a kink, a jump of the clock a step: both peak where the cut belongs
+    # a change of rate is a kink, a jump of the clock a step: both peak at the cut
     step = np.diff(t)
     k = int(np.argmax(np.abs(t - (t[0] + np.arange(n) * dt))))
     if 0 < k < n - 1 and abs(step[k] - dt) > abs(step[k - 1] - dt) + 0.1 * dt:
@@ -210,26 +187,25 @@ def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
     if not _SHORT <= k <= n - _SHORT:
         return []
     rms = float(np.std(residual))
-    parts = sorted(float(np.std(_residual_of(part))) for part in (t[:k], t[k:]))
+    parts = sorted(float(np.std(_line_residual(part))) for part in (t[:k], t[k:]))
     # behind a true cut one side at least is clean; jitter does not get smaller by cutting
     return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
 
 
-def _residual_of(t: Array) -> Array:
-    """Return what a least-squares line leaves of the stamps [s]."""
+def _line_residual(t: Array) -> Array:
+    """Return the distance of the stamps from their least-squares line [s]."""
     k = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t[0]
     x -= x.mean()
-    residual: Array = x - k * (np.dot(k, x) / np.dot(k, k))
-    return residual
+    return np.asarray(x - k * (np.dot(k, x) / np.dot(k, k)))
 
 
 def _scatters(t: Array) -> bool:
     """
     Return whether increasing stamps [s] scatter about one uniform clock.
 
-    They do where a line is off by less than half a sample everywhere, neighbours stray on their
-    own, and what jumps forward comes back.
+    Stamps scatter if a line is off by less than half a sample everywhere, neighbours stray on
+    their own, and time that jumps forward comes back.
 
     >>> t = np.arange(100.0)
     >>> _scatters(t + 0.3 * np.sin(t**2)), _scatters(np.delete(t, 50))
@@ -237,7 +213,7 @@ def _scatters(t: Array) -> bool:
     """
     if t.size < _LEAST:
         return False
-    residual = _residual_of(t)
+    residual = _line_residual(t)
     if 2 * np.abs(residual).max() >= (t[-1] - t[0]) / (t.size - 1):
         return False
     step = np.diff(residual)
@@ -247,11 +223,7 @@ def _scatters(t: Array) -> bool:
 
 
 def _without_scatter(t: Array, cuts: Integers) -> Integers:
-    """
-    Return where to cut increasing stamps [s] when steps that scatter are no breaks.
-
-    `cuts` are the first samples behind breaks, as steps between neighbours tell them.
-    """
+    """Return the cuts of increasing stamps [s] that are more than scatter."""
     if not cuts.size:
         return cuts
     marks = np.array([0, *_jumps(t), t.size], dtype=np.int64)
@@ -266,16 +238,16 @@ def _without_scatter(t: Array, cuts: Integers) -> Integers:
 
 def _jumps(t: Array) -> Iterator[int]:
     """Yield the samples before which time jumps by more than half a step, and stays there."""
-    dt = float(np.median(np.diff(t[:_CHUNK])))
+    dt = float(np.median(np.diff(t[:CHUNK])))
     # mean time behind a sample less that before it, in terms of the steps between
     weights = 1 - np.abs(np.arange(1 - _AROUND, _AROUND)) / _AROUND
-    for at in range(0, t.size - 1, _CHUNK):
+    for at in range(0, t.size - 1, CHUNK):
         first = max(at - 2 * _AROUND, 0)
-        step = np.diff(t[first : at + _CHUNK + 2 * _AROUND]) - dt
+        step = np.diff(t[first : at + CHUNK + 2 * _AROUND]) - dt
         ahead = np.convolve(step, weights)[_AROUND - 1 : 1 - _AROUND] > 0.5 * dt
         for start, stop in true_runs(ahead):
             k = first + int(start + np.argmax(step[start:stop])) + 1
-            if at < k <= at + _CHUNK:
+            if at < k <= at + CHUNK:
                 yield k
 
 
@@ -283,15 +255,15 @@ def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> 
     """
     Fit a uniform clock to increasing stamps [s], two at least, of one uniform stretch.
 
-    Its rate is the one of fewest digits that the stamps allow, at the resolution of the whole
-    file.  Rates [Hz] that are `known` are preferred, in their order, where the stamps allow them:
-    a short stretch cannot tell its rate as well as a longer one of the same file.
+    The rate is the allowed rate of fewest digits, at the resolution of the whole file.  Rates [Hz]
+    that are `known` come first, in their order, if the stamps allow them: a long stretch of a file
+    tells the rate better than a short one.
     """
     dt = float(t[-1] - t[0]) / (t.size - 1)
-    low, high = rate_bounds(t, _rounding(resolution, dt))
+    low, high = rate_bounds(t, lambda x: resolution.error(x, dt))
     jitter, start = 0.0, float(t[0])
     if low > high:
-        residual = _residual_of(t)
+        residual = _line_residual(t)
         deviation = float(np.abs(residual).max())
         jitter, start = deviation / dt, float(t[0] - residual[0])
         slack = 2 * deviation / float(t[-1] - t[0])
@@ -312,18 +284,21 @@ def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> 
 
 
 def _settled(clock: Clock, n: int) -> Clock:
-    """Return the clock that its own stamps are read as, so that a file written reads the same."""
+    """Return the clock that is read from its own stamps: a written file reads the same."""
     for _ in range(5):
         t = time_stamps(clock.sample_rate, clock.start_time, 0, n)
         resolution = Resolution.of(t)
         low, high = rate_bounds(t, _last_bit)
         if not low <= high:
             return clock
-        again = [Clock(r, _start(float(t[0]), r, resolution), 0.0) for r in nice_rates(low, high)]
+        start = float(t[0])
+        again = [
+            Clock(r, _start(start, r, resolution), clock.jitter) for r in nice_rates(low, high)
+        ]
         exact = next((c for c in again if _reproduces(c, t)), again[0])
-        if exact.sample_rate == clock.sample_rate and exact.start_time == clock.start_time:
+        if exact == clock:
             return clock
-        clock = Clock(exact.sample_rate, exact.start_time, clock.jitter)
+        clock = exact
     return clock
 
 
@@ -332,17 +307,12 @@ def _last_bit(t: Array) -> Array:
     return 0.75 * np.spacing(np.abs(t))
 
 
-def _rounding(resolution: Resolution, dt: float) -> Callable[[Array], Array]:
-    # steps of one or two units of the last decimal are exact more often than rounded
-    return lambda t: np.minimum(resolution.half(t), 0.2 * dt) + 8 * np.spacing(np.abs(t))
-
-
 def rate_bounds(t: Array, half: Callable[[Array], Array]) -> tuple[float, float]:
-    """Return the smallest and largest rate through all stamps +- `half`, crossed when none is."""
+    """Return the smallest and largest rate through all stamps +- `half`; crossed for no rate."""
     low, high = 0.0, np.inf
     first = float(half(t[:1])[0])
-    for i in range(1, t.size, _CHUNK):
-        part = t[i : i + _CHUNK]
+    for i in range(1, t.size, CHUNK):
+        part = t[i : i + CHUNK]
         k = np.arange(i, i + part.size, dtype=np.float64)
         elapsed, error = part - t[0], half(part) + first
         low = max(low, float(np.max(k / (elapsed + error))))
@@ -353,7 +323,7 @@ def rate_bounds(t: Array, half: Callable[[Array], Array]) -> tuple[float, float]
 
 
 def nice_rates(low: float, high: float) -> Iterator[float]:
-    """Yield rates between two bounds, those with few digits (or whose period has few) first."""
+    """Yield rates between two bounds; rates or periods with few digits come first."""
     middle = 0.5 * (low + high)
     for digits in range(15):
         for rate in (float(f'{middle:.{digits}e}'), 1 / float(f'{1 / middle:.{digits}e}')):
@@ -365,26 +335,23 @@ def nice_rates(low: float, high: float) -> Iterator[float]:
 def _start(t0: float, rate: float, resolution: Resolution) -> float:
     """Return the tick of the sample clock that a first stamp means, or the stamp itself."""
     tick = round(t0 * rate) / rate
-    x = np.array([t0])
-    slack = float(_rounding(resolution, 1 / rate)(x)[0])
+    slack = float(resolution.error(np.array([t0]), 1 / rate)[0])
     return tick if abs(tick - t0) <= slack else t0
 
 
 def _reproduces(clock: Clock, t: Array) -> bool:
-    def part(i: int) -> Array:
-        return time_stamps(clock.sample_rate, clock.start_time, i, min(i + _CHUNK, t.size))
-
-    return all(np.array_equal(part(i), t[i : i + _CHUNK]) for i in range(0, t.size, _CHUNK))
+    parts = (slice(i, min(i + CHUNK, t.size)) for i in range(0, t.size, CHUNK))
+    return all(np.array_equal(time_stamps(*clock[:2], p.start, p.stop), t[p]) for p in parts)
 
 
 def has_restarted(first: float, last: float, begin: float, period: float) -> bool:
     """
     Return whether time that jumps back is a restart of the sample clock.
 
-    It is when the new stretch starts at or before the start of the old one, or more than
-    `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.  The
-    times [s] are those of the first sample of the new stretch, of the newest sample so far, and of
-    the first one since the last restart; `period` is the sampling period [s].
+    The clock has restarted if the new stretch starts at or before the start of the old one, or
+    more than `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.
+    The times [s] are those of the first sample of the new stretch, of the newest sample so far,
+    and of the first sample since the last restart; `period` is the sampling period [s].
 
     >>> has_restarted(0.0, last=0.02, begin=0.0, period=5e-5)
     True

@@ -44,11 +44,11 @@ WRITERS: Mapping[str, Callable[[BinaryIO, Blocks, Sequence[str], Sequence[int]],
 SHEETS = ('.xlsx', '.xls', '.ods')
 _WRITTEN = 'a bag folder, .mcap, .db3, .csv, .npz or .mat'
 _READ = f'a bag folder, .mcap, .db3, {", ".join(READERS)}'
-#: sampling rates [Hz] at which time in another unit than seconds is likelier
+#: another unit than seconds is likelier at lower or higher sampling rates [Hz] (taste)
 SLOW, FAST = 50.0, 1e6
-#: strokes [m] and spans of a voltage [V] at which another unit is likelier
+#: another unit is likelier at larger strokes [m] or spans of a voltage [V] (taste)
 LARGE_STROKE, HIGH_VOLTAGE = 1e-3, 2e3
-#: and gains [m/V], whatever unit is named
+#: a named unit is doubtful at larger gains [m/V] (taste)
 LARGE_GAIN = 5e-4
 
 
@@ -63,13 +63,13 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         .parquet.
     options : ReadOptions, optional
     **choices
-        Fields of `ReadOptions`, in place of those of `options`.  For tables
-        ``columns={'t': 'time_s', 'v': 'voltage', 'y': 'position_um'}``, guessed by the header when
-        absent; ``rate=20e3`` where there is no time; ``time_unit='ms'``, ``voltage_unit``,
+        Fields of `ReadOptions` that replace those of `options`.  For tables
+        ``columns={'t': 'time_s', 'v': 'voltage', 'y': 'position_um'}``, by default guessed by the
+        header; ``rate=20e3`` for a table without time; ``time_unit='ms'``, ``voltage_unit``,
         ``displacement_unit='um'``; ``voltage_limits=(0, 10)``; ``voltage_alone=True`` for a table
-        without displacement, which is then NaN, and ``displacement_alone=True`` for one without
-        voltage.  For bags ``namespace``, ``voltage_topic``,
-        ``displacement_topic``, and ``recover=True`` for an unfinished one.
+        without displacement, which is then NaN, ``displacement_alone=True`` for a table without
+        voltage.  For bags ``namespace``, ``voltage_topic``, ``displacement_topic``, and
+        ``recover=True`` for an unfinished bag.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     Raises
     ------
     DataError
-        When the file cannot be used; the message names the file, the place and the cure.
+        If the file cannot be used; the message names the file, the place and the cure.
 
     Examples
     --------
@@ -95,8 +95,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     options = replace(options or ReadOptions(), **choices)
     path = Path(path)
     suffix = path.suffix.lower()
-    broken = broken_link(path)
-    if broken:
+    if broken := broken_link(path):
         raise DataError(f'{path}: {broken}')
     if path.is_dir() or storage_of(path):
         return read_bag(path, options)
@@ -112,12 +111,11 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
         reason = error.strerror or str(error)
         raise DataError(f'{path}: cannot be read ({reason}); check the file') from None
     columns = dict(table.columns)
-    for role in columns:
-        factor = _factor(table, role)
-        if role_of(role) == 'y':
-            # the unit of y is met with y itself, for all displacements
-            factor /= _factor(table, 'y')
-        if role != 'y' and factor != 1.0:
+    factors = {k: unit_factor(role_of(k) or k, table.units.get(k, '')) for k in ('y', *columns)}
+    for role in columns.keys() - {'y'}:
+        # `assemble` scales all displacements by the unit of y
+        factor = factors[role] / (factors['y'] if role_of(role) == 'y' else 1.0)
+        if factor != 1.0:
             columns[role] = columns[role] / factor
     v, y = (columns.pop(role, None) for role in 'vy')
     n = next(x.size for x in (v, y) if x is not None)
@@ -140,19 +138,14 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     return replace(record, faults=(*record.faults, *_doubts(record, table, options)))
 
 
-def _factor(table: RecordTable, role: str) -> float:
-    """Return how many of a column's unit make one of SI; 1 where no unit is named."""
-    return unit_factor(role_of(role) or role, table.units.get(role, ''))
-
-
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
-    """Yield where another unit is likelier than the default, or than that of a header."""
+    """Yield the quantities of which another unit is likelier than that of the header."""
     rates = [piece.sample_rate for piece in record]
     slow, fast = ('slow', min(rates)), ('fast', max(rates))
     for kind, rate in [slow] * (slow[1] <= SLOW) + [fast] * (fast[1] > FAST):
         where = f'sampled at {rate:.6g} Hz'
         if table.rate is not None:
-            # one that the file names may be counted in another unit
+            # the file may count its rate in another unit
             other = f'{rate * (1e3 if kind == "slow" else 1e-3):.9g}'
             way = f'--rate {other if options.rate is None else "20e3"}'
             cure = f'is it in Hz? else give it as in {way}'
@@ -167,13 +160,14 @@ def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterato
         else:
             continue
         yield Fault(f'{kind}_sampling', f'{where}, unusual for a stage', 1, cure)
-    if 'y' in table.columns and 'y' not in table.units and record.stroke > LARGE_STROKE:
-        where = f'a stroke of {1e3 * record.stroke:.3g} mm with y in metres'
+    low, high = record.voltage_range
+    stroke = record.stroke if 'y' in table.columns else 0.0
+    if 'y' not in table.units and stroke > LARGE_STROKE:
+        where = f'a stroke of {1e3 * stroke:.3g} mm with y in metres'
         cure = 'if y counts micrometres, add --displacement-unit um'
         yield Fault('large_stroke', where, 1, cure)
-    low, high = record.voltage_range
-    if 'y' in table.columns and record.stroke > LARGE_GAIN * (high - low) > 0.0:
-        where = f'a stroke of {1e6 * record.stroke:.3g} um from {low:.4g} to {high:.4g} V'
+    if stroke > LARGE_GAIN * (high - low) > 0.0:
+        where = f'a stroke of {1e6 * stroke:.3g} um from {low:.4g} to {high:.4g} V'
         cure = 'are the units right? --voltage-unit and --displacement-unit name others'
         yield Fault('large_gain', where, 1, cure)
     if high - low > HIGH_VOLTAGE and 'v' not in table.units:
@@ -198,9 +192,9 @@ def write(
     record : Record
         No file keeps its faults.
     path : path
-        Where to; nothing is left there when writing fails.
+        Nothing is left there if writing fails.
     overwrite : bool
-        Replace what stands there.
+        Replace an older file.
     storage : {'mcap', 'sqlite3'}, optional
         Storage of a bag folder.
     custom_data : mapping of str to str, optional
@@ -209,12 +203,12 @@ def write(
     Returns
     -------
     tuple of str
-        What reading the file will not give back, a line each; empty when it gives back all.
+        A line for each loss: a difference between the record and the file read again.
 
     Raises
     ------
     DataError
-        When the record does not fit into a file, or the file cannot be written.
+        If the record does not fit into a file, or the file cannot be written.
 
     Examples
     --------
@@ -234,7 +228,7 @@ def write(
         raise DataError(f'{path}: unknown format {suffix}; give {_WRITTEN}')
     if not is_bag and storage is not None:
         raise DataError(f'{path}: a storage is for bags only; leave it out')
-    # where the displacement alone is unknown, NaN keeps the voltage
+    # NaN displacements keep the voltage between two pieces
     every = (part for piece in record for part in (piece.before, piece) if part)
     rows = replace(record, pieces=tuple(every))
     if is_bag:
@@ -269,16 +263,16 @@ def _check_labels(record: Record, path: Path) -> None:
         raise DataError(f'{path}: pieces carry different channels; write them one by one')
     for name in record.pieces[0].channels:
         # the names that ROS topics and MATLAB variables can have
-        if not re.fullmatch(r'[A-Za-z0-9_]{1,60}', name):
+        is_plain = re.fullmatch(r'[A-Za-z0-9_]{1,60}', name)
+        if not is_plain or channel_of_column(column_of(name)) != name:
             raise DataError(
-                f'{path}: channel name {name!r} cannot be written; use letters, digits and _'
+                f'{path}: channel name {name!r} cannot be written and read; use letters, digits '
+                'and _, and no unit'
             )
-        if channel_of_column(column_of(name)) != name:
-            raise DataError(f'{path}: channel name {name!r} cannot be read back')
 
 
 def _losses(record: Record, rows: Record) -> tuple[str, ...]:
-    """Read the columns of the rows as a reader would, and say what differs from the record."""
+    """Read the columns of the rows as a reader does; say where they differ from the record."""
 
     def whole(parts: list[Array]) -> Array:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -289,19 +283,14 @@ def _losses(record: Record, rows: Record) -> tuple[str, ...]:
         back = assemble(t, v, y, labels_of(rows), channels, name='the file')
     except DataError as error:
         return (f'reading refuses it: {error}',)
-    losses = []
     if len(back.pieces) != len(record.pieces) or back.n != record.n:
-        losses.append(
-            f'{len(record.pieces)} pieces with {record.n} samples read back as '
-            f'{len(back.pieces)} with {back.n}'
-        )
-    elif any(
-        abs(a.sample_rate / b.sample_rate - 1.0) > 1e-9 for a, b in zip(record, back, strict=True)
-    ):
-        rates = ', '.join(f'{r:.12g}' for r in dict.fromkeys(p.sample_rate for p in back))
-        losses.append(f'sampling rates read back as {rates} Hz')
-    before = [s for p in record for s in p.segments]
-    after = [s for p in back for s in p.segments]
-    if not losses and before != after:
-        losses.append(f'{len(before)} segments read back as {len(after)}')
-    return tuple(losses)
+        before = f'{len(record.pieces)} pieces with {record.n} samples'
+        return (f'{before} read back as {len(back.pieces)} with {back.n}',)
+    rates = [(a.sample_rate, b.sample_rate) for a, b in zip(record, back, strict=True)]
+    if any(abs(a / b - 1.0) > 1e-9 for a, b in rates):
+        text = ', '.join(f'{rate:.12g}' for rate in dict.fromkeys(b for _, b in rates))
+        return (f'sampling rates read back as {text} Hz',)
+    segments = [[s for p in one for s in p.segments] for one in (record, back)]
+    if segments[0] != segments[1]:
+        return (f'{len(segments[0])} segments read back as {len(segments[1])}',)
+    return ()

@@ -5,20 +5,20 @@
 A record from streams of blocks, whether they come live or from a bag.
 
 Voltage and displacement meet on equal time stamps.  Blocks may be lost, come twice, or start over
-with a restarted clock, and the streams need not be cut into the same blocks.  Equal time stamps in
-one stream are matched in turn with those of the other; after a loss, the two that arrived closest
-to each other belong together.
+with a restarted clock, and the streams need not be cut into the same blocks.  Equal time stamps of
+two streams are matched in turn; after a loss, the two stamps that arrived closest to each other
+belong together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array, Integers, Mask
+from piezo_ident.common.arrays import Array, CHUNK, Integers, Mask
 from piezo_ident.common.errors import DataError, OrderError
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.blocks import HELD, RAMPED
@@ -31,19 +31,18 @@ from piezo_ident.record.stream import BlockStream
 
 __all__ = ['APPLIED', 'MAX_MISSING', 'Joined', 'join', 'record_of_streams']
 
-#: equal times of two streams: first row of the one, first row of the other, how many rows
+#: equal times of two streams: first row in either stream, number of rows
 Matches = list[tuple[int, int, int]]
 
 #: commanded and applied voltage may differ by this share of the range
 TOLERANCE = 1e-3
-#: most of a segment by time, or of a further channel, that may be missing before it is not used
+#: share of a segment, or of a further channel, beyond which missing samples make it unusable
 MAX_MISSING = 0.05
-#: least share of the samples of one clock in common, from the latest start to the earliest end
+#: least share of the samples in common, from the latest start to the earliest end: clocks that
+#: differ meet by chance now and then
 MET = 0.1
-#: rows of a stream no further apart than this are of the same run of the sample clock
+#: rows of a stream at most so far apart belong to the same run of the sample clock
 NEARBY = 300
-#: rows that are compared together
-_CHUNK = 1 << 20
 
 
 def record_of_streams(
@@ -55,25 +54,12 @@ def record_of_streams(
     faults: Iterable[Fault] = (),
 ) -> Record:
     """
-    Make a record of streams of blocks.
+    Make a record of streams of blocks, by quantity: ``voltage``, ``displacement`` and further.
 
-    Parameters
-    ----------
-    streams : mapping of str to BlockStream
-        Those of ``voltage``, ``displacement``, ``x_<name>``, ``voltage_<name>``,
-        ``displacement_<name>``, and of each voltage ``applied_voltage``.  Where command and
-        applied voltage differ, the amplifier's guard was at work: the stage did not get the
-        command, so these samples are cut out.  A further axis or channel that lacks more than
-        `MAX_MISSING` of the samples is left out.
-    name : str
-        Name of the record, also in errors.
-    options, sample_rate, faults
-        As for `piezo_ident.record.assemble.assemble`.
-
-    Raises
-    ------
-    DataError
-        For data that cannot be used without a guess.
+    Samples whose command and ``applied_voltage`` differ are cut out: the guard of the amplifier
+    was at work, and the stage did not get the command.  A further axis or channel that lacks more
+    than `MAX_MISSING` of the samples is left out.  The other arguments, and the errors, are those
+    of `piezo_ident.record.assemble.assemble`.
     """
     n = min(streams['voltage'].n, streams['displacement'].n)
     sparse = {
@@ -112,9 +98,8 @@ def record_of_streams(
         ) from None
 
 
-@dataclass(frozen=True, eq=False)
-class Joined:
-    """Columns of equal length, the segments' names and starts, and what was met on the way."""
+class Joined(NamedTuple):
+    """Columns of equal length, names and starts of the segments, and the faults that were met."""
 
     t: Array
     columns: dict[str, Array]
@@ -122,10 +107,9 @@ class Joined:
     faults: tuple[Fault, ...]
 
 
-def _driven_alone(name: str, stream: BlockStream) -> list[Fault]:
+def _driven_alone(name: str, stream: BlockStream) -> Iterator[Fault]:
     """Say where a driver moved the stage by itself while commands were on their way."""
     (labels, starts), t = stream.labels(), stream.times
-    faults = []
     for label, action in (
         (HELD, 'the command did not come, the driver held its voltage'),
         (RAMPED, 'no command came for long, the driver ramped to rest'),
@@ -138,16 +122,16 @@ def _driven_alone(name: str, stream: BlockStream) -> list[Fault]:
         ]
         if rows:
             where = f'in {name}, {at_times(t[[a for a, _ in rows]])}'
-            faults.append(Fault(label, where, int(sum(b - a for a, b in rows)), action))
-    return faults
+            yield Fault(label, where, int(sum(b - a for a, b in rows)), action)
 
 
 def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> Joined:
-    """Cut out the samples at which another voltage was applied than commanded."""
+    """Cut out the samples whose applied voltage is not the commanded one."""
     columns = dict(joined.columns)
     v, applied, t = columns[key], columns.pop(applied_key(key)), joined.t
+    joined = joined._replace(columns=columns)
     if np.array_equal(v, applied):
-        return replace(joined, columns=columns)
+        return joined
     unknown = np.isnan(applied)
     if unknown.any():
         where, count = at_times(t[unknown][:1]), int(np.count_nonzero(unknown))
@@ -155,24 +139,23 @@ def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> J
     finite = v[np.isfinite(v)]
     span = float(np.ptp(finite)) if finite.size else 0.0
     tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
-    wrong = np.abs(v - applied) > tolerance  # False where either is NaN
+    wrong = np.abs(v - applied) > tolerance  # False for NaN
     if wrong.all():
         raise DataError(
             f'{name}: the applied voltage is nowhere the commanded one; look at the guards of the '
             "amplifier's driver"
         )
     if not wrong.any():
-        return replace(joined, columns=columns)
+        return joined
     worst = float(np.abs(v - applied)[wrong].max())
-    begins = np.flatnonzero(wrong & ~np.concatenate([[False], wrong[:-1]]))
+    begins = np.flatnonzero(wrong & ~np.append(False, wrong[:-1]))
     where = f'{at_times(t[begins])}, by up to {worst:.3g} V'
     count = int(np.count_nonzero(wrong))
     met.append(Fault('guarded_voltage', where, count, 'cut out, record split there'))
     keep = np.flatnonzero(~wrong)
     names, starts = joined.segments
     columns = {key: x[keep] for key, x in columns.items()}
-    segments = names, np.searchsorted(keep, starts).tolist()
-    return Joined(t[keep], columns, segments, joined.faults)
+    return Joined(t[keep], columns, (names, np.searchsorted(keep, starts).tolist()), joined.faults)
 
 
 def join(
@@ -181,18 +164,17 @@ def join(
     """
     Join streams, by quantity, on their time stamps: one column a stream.
 
-    The first one gives the order and the segments.  Streams `beside` are looked up where they have
-    a value, and leave NaN where they have none.  DataError when a stream has two values for one
-    time, or no stamp is in all streams.
+    The first stream gives the order and the segments.  Columns of streams `beside` are NaN at
+    times that their stream lacks.  DataError if a stream has two values for one time, or no stamp
+    is in all streams.
     """
-    beside = beside or {}
+    every = {**streams, **(beside or {})}
     first, lead = next(iter(streams.items()))
-    times = {name: s.times for name, s in {**streams, **beside}.items()}
+    times = {name: s.times for name, s in every.items()}
     t = times[first]
-    in_step = _in_step({**streams, **beside}, times)
+    in_step = _in_step(every, times)
     matches = in_step or {
-        name: _matches(t, lead.arrivals, times[name], s.arrivals)
-        for name, s in {**streams, **beside}.items()
+        name: _matches(t, lead.arrivals, times[name], s.arrivals) for name, s in every.items()
     }
     keep = np.ones(lead.n, dtype=np.bool_)
     for name in streams:
@@ -200,8 +182,10 @@ def join(
         for i, _, n in (*matches[name], (lead.n, 0, 0)):
             keep[end:i] = False
             end = i + n
-    shared, fewest = int(np.count_nonzero(keep)), _fewest([times[name] for name in streams])
-    # clocks that differ meet by chance now and then
+    shared = int(np.count_nonzero(keep))
+    low = max(np.nanmin(times[name], initial=np.inf) for name in streams)
+    high = min(np.nanmax(times[name], initial=-np.inf) for name in streams)
+    fewest = min(int(np.count_nonzero((times[k] >= low) & (times[k] <= high))) for k in streams)
     if shared < MET * fewest or not shared:
         much = f'only {shared} of {fewest} time stamps' if shared else 'no time stamp'
         raise DataError(
@@ -210,29 +194,25 @@ def join(
         )
     faults: list[Fault] = []
     columns = {}
-    for name, stream in {**streams, **beside}.items():
+    for name, stream in every.items():
         values = stream.values
-        columns[name] = _cut(values, matches[name], keep, alone=name in beside)
+        columns[name] = _cut(values, matches[name], keep, alone=name not in streams)
         if name in streams:
             left = np.ones(stream.n, dtype=np.bool_)
             for i, j, n in matches[name]:
                 left[j : j + n] = ~keep[i : i + n]
-            # in step no row has a twin but among those that are left
+            # of streams in step, only rows that are left have a twin
             rows = np.flatnonzero(left) if in_step else np.arange(left.size)
             if left.any():
                 faults += _left_over(name, times[name][rows], values[rows], left[rows])
-    return Joined(_cut(t, matches[first], keep), columns, _labels(lead, keep), tuple(faults))
-
-
-def _fewest(times: Sequence[Array]) -> int:
-    """Return how many rows a stream has at least, from the latest start to the earliest end."""
-    low = max(np.nanmin(t, initial=np.inf) for t in times)
-    high = min(np.nanmax(t, initial=-np.inf) for t in times)
-    return min(int(np.count_nonzero((t >= low) & (t <= high))) for t in times)
+    names, starts = lead.labels()
+    sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else starts
+    segments = names, (np.cumsum(sizes) - sizes).tolist()
+    return Joined(_cut(t, matches[first], keep), columns, segments, tuple(faults))
 
 
 def _cut(x: Array, matches: Matches, keep: Mask, *, alone: bool = False) -> Array:
-    """Return the values of the rows that are kept; `alone`, NaN where the stream has none."""
+    """Return the values of the rows that are kept; `alone`, NaN for rows the stream lacks."""
     if alone:
         column = np.full(keep.size, np.nan)
         for i, j, n in matches:
@@ -241,31 +221,22 @@ def _cut(x: Array, matches: Matches, keep: Mask, *, alone: bool = False) -> Arra
     parts = []
     for i, j, n in matches:
         kept = keep[i : i + n]
-        rows = np.flatnonzero(kept[1:] != kept[:-1]) + 1
-        # what stays in one go needs no copy
-        parts += [
-            x[j + a : j + b] for a, b in itertools.pairwise([0, *rows.tolist(), n]) if kept[a]
-        ]
+        rows = [0, *(np.flatnonzero(kept[1:] != kept[:-1]) + 1).tolist(), n]
+        # rows that stay in one go need no copy
+        parts += [x[j + a : j + b] for a, b in itertools.pairwise(rows) if kept[a]]
     column = parts[0] if len(parts) == 1 else np.concatenate(parts)
     column.setflags(write=False)
     return column
-
-
-def _labels(stream: BlockStream, keep: Mask) -> tuple[list[str], list[int]]:
-    """Return the label of each stretch, and how many rows before it are kept."""
-    names, starts = stream.labels()
-    sizes = np.add.reduceat(keep, starts, dtype=np.int64) if names else starts
-    return names, (np.cumsum(sizes) - sizes).tolist()
 
 
 def _in_step(
     streams: Mapping[str, BlockStream], times: Mapping[str, Array]
 ) -> dict[str, Matches] | None:
     """
-    Return what the streams share, run by run, where all went through the same runs of the clock.
+    Return the rows that the streams share, run by run of the sample clock.
 
-    That is so wherever nothing came twice: hours of samples are then joined without a table of
-    partners.  None where it is not so.
+    None unless all streams went through the same runs and nothing came twice.  Hours of samples
+    are then joined without a table of partners.
     """
     begins, came = {}, {}
     for name, t in times.items():
@@ -278,32 +249,38 @@ def _in_step(
                 return None
         came[name] = streams[name].arrived(np.array(begin))
     first = next(iter(times))
+    one = came[first]
     matches: dict[str, Matches] = {}
     for name, t in times.items():
-        one, other = came[first], came[name]
-        if one.size != other.size:
+        other = came[name]
+        # runs of one clock are told apart by their times of arrival
+        if (
+            one.size != other.size
+            or (other[1:] <= one[:-1]).any()
+            or (one[1:] <= other[:-1]).any()
+        ):
             return None
-        # runs of one clock are told apart by when they came
-        if (other[1:] <= one[:-1]).any() or (one[1:] <= other[:-1]).any():
-            return None
-        runs = zip(
+        merged: Matches = []
+        for (a, b), (c, d) in zip(
             itertools.pairwise([*begins[first], times[first].size]),
             itertools.pairwise([*begins[name], t.size]),
             strict=True,
-        )
-        matches[name] = _merged(
-            (a + i, c + j, n)
-            for (a, b), (c, d) in runs
-            for i, j, n in _shared(times[first][a:b], t[c:d])
-        )
+        ):
+            for i, j, n in _shared(times[first][a:b], t[c:d]):
+                x, y, m = merged[-1] if merged else (-1, -1, 0)
+                if (a + i, c + j) == (x + m, y + m):
+                    merged[-1] = (x, y, m + n)
+                else:
+                    merged.append((a + i, c + j, n))
+        matches[name] = merged
     return matches
 
 
 def _shared(one: Array, other: Array) -> Iterator[tuple[int, int, int]]:
-    """Yield where two rising columns of times go on alike."""
+    """Yield the stretches that two rising columns of times share."""
     i = j = 0
     while i < one.size and j < other.size:
-        n = min(one.size - i, other.size - j, _CHUNK)
+        n = min(one.size - i, other.size - j, CHUNK)
         part = one[i : i + n]
         if np.array_equal(part, other[j : j + n]):
             yield i, j, n
@@ -318,25 +295,14 @@ def _shared(one: Array, other: Array) -> Iterator[tuple[int, int, int]]:
 
 
 def _stretches(rows: NDArray[np.intp], partners: NDArray[np.intp]) -> Matches:
-    """Return rising rows and their partners as stretches in which both go on."""
+    """Return rising rows and their partners as stretches."""
     cuts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(partners) != 1)) + 1
     bounds = itertools.pairwise([0, *cuts.tolist(), rows.size])
     return [(int(rows[a]), int(partners[a]), b - a) for a, b in bounds if a < b]
 
 
-def _merged(matches: Iterable[tuple[int, int, int]]) -> Matches:
-    """Return matches with those that go on where the one before ended as one."""
-    merged: Matches = []
-    for i, j, n in matches:
-        if merged and (i, j) == (merged[-1][0] + merged[-1][2], merged[-1][1] + merged[-1][2]):
-            merged[-1] = (*merged[-1][:2], merged[-1][2] + n)
-        else:
-            merged.append((i, j, n))
-    return merged
-
-
 def _matches(ta: Array, arrived_a: Integers, tb: Array, arrived_b: Integers) -> Matches:
-    """Return what two streams share, rows of the same time paired by when they came."""
+    """Return the rows that two streams share; rows of the same time pair by their arrival."""
     t, arrived = np.concatenate([ta, tb]), np.concatenate([arrived_a, arrived_b])
     by = np.lexsort((arrived, t))
     nearest = _nearest(t[by], arrived[by], by >= ta.size)
@@ -348,7 +314,7 @@ def _matches(ta: Array, arrived_a: Integers, tb: Array, arrived_b: Integers) -> 
 
 
 def _nearest(t: Array, arrived: Integers, in_b: Mask) -> Integers:
-    """Return for sorted rows of two streams the row of the other with equal time, -1 for none."""
+    """Return the nearest row of the other stream with equal time for sorted rows, -1 for none."""
     here = np.arange(t.size)
     best = np.full(t.size, -1)
     distance = np.full(t.size, np.iinfo(np.int64).max)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a record is read: what a file does not say by itself."""
+"""How a record is read: units, columns and topics that a file does not name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import unicodedata
 
 from piezo_ident.common.errors import DataError, expect
 
-#: how many of a unit make a second, a volt and a metre
+#: number of each unit in a second, a volt and a metre
 UNITS: Mapping[str, Mapping[str, float]] = {
     't': {'s': 1.0, 'ms': 1e3, 'us': 1e6, 'ns': 1e9, 'min': 1 / 60},
     'v': {'V': 1.0, 'mV': 1e3, 'uV': 1e6, 'kV': 1e-3},
@@ -31,35 +31,35 @@ class ReadOptions:
     Parameters
     ----------
     displacement_unit : {'m', 'mm', 'um', 'nm'}, optional
-        Unit of the displacement in the file; by default what the header says, else m.  With a
-        number before it, what one of the file is: ``'10um/V'`` of a sensor's volts.  So are the
-        other units: ``'20V'`` of a monitor that shows a twentieth.  Where the header names mV, a
-        number still belongs to one volt; a unit without a number must be that of the header.
+        Unit of the displacement in the file; by default the unit of the header, else m.  A number
+        before the unit scales one of the file: ``'10um/V'`` for a sensor that writes volts, and
+        likewise ``'20V'`` for a monitor that shows a twentieth.  Under a header of mV, a number
+        still belongs to one volt.  A unit without a number must agree with the header.
     voltage_limits : tuple of float, optional
         Smallest and largest voltage [V] that may occur.
     namespace, voltage_topic, displacement_topic : str, optional
-        Which topics of a bag to take, when it holds several stages.
+        Topics to take from a bag with several stages.
     recover : bool, optional
         Read an unfinished bag as far as it goes instead of refusing it.
     voltage_alone : bool, optional
-        Take a table without displacement, as of a planned scan; the displacement is then NaN.
+        Take a table without displacement, for example of a planned scan; y is then NaN.
     displacement_alone : bool, optional
-        Take a table without voltage, as of a motion that is wanted; the voltage is then NaN.
+        Take a table without voltage, for example of a wanted motion; v is then NaN.
     columns : mapping of str to str, or str, optional
         Name or number (from 1) of the columns ``t``, ``v``, ``y``, ``segment``, ``v_<name>`` and
-        ``y_<name>`` of further axes, and ``x_<name>``; those left out are taken by the header.
+        ``y_<name>`` of further axes, and ``x_<name>``; by default the header names them.
         Also as text, ``'t=time_s,v=voltage'``.
     rate : float, optional
         Samples a second [Hz]; the time of sample k is then k / rate, and no column is read.
     time_unit : {'s', 'ms', 'us', 'ns', 'min'}, optional
-        Unit of the time in the file; by default what the header says, else s.
+        Unit of the time in the file; by default the unit of the header, else s.
     voltage_unit : {'V', 'mV', 'uV', 'kV'}, optional
-        Unit of the voltage in the file; by default what the header says, else V.
+        Unit of the voltage in the file; by default the unit of the header, else V.
 
     Raises
     ------
     DataError
-        When a unit is unknown, the rate is no positive number, or `columns` names something else.
+        For an unknown unit, a rate that is no positive number, or an unknown quantity.
     """
 
     displacement_unit: str | None = None
@@ -110,16 +110,12 @@ class ReadOptions:
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """What a table must have."""
-        absent = {
-            't': self.rate is not None,
-            'v': self.displacement_alone,
-            'y': self.voltage_alone,
-        }
-        return tuple(role for role in 'tvy' if not absent[role])
+        """The columns that a table must have."""
+        absent = self.rate is not None, self.displacement_alone, self.voltage_alone
+        return tuple(role for role, gone in zip('tvy', absent, strict=True) if not gone)
 
     def unit(self, role: str) -> str | None:
-        """Return the unit that is given for ``t``, ``v`` or ``y``."""
+        """Return the given unit of ``t``, ``v`` or ``y``."""
         return {'t': self.time_unit, 'v': self.voltage_unit, 'y': self.displacement_unit}[role]
 
 
@@ -132,18 +128,13 @@ def plain_unit(text: str) -> str:
     """
     # NFKC turns the micro sign into the Greek letter
     text = unicodedata.normalize('NFKC', text).strip().replace('\u03bc', 'u')
-    for units in UNITS.values():
-        for unit in units:
-            if text.lower() == unit.lower():
-                return unit
-    return _SPELT.get(text.lower(), text)
+    known = {unit.lower(): unit for units in UNITS.values() for unit in units}
+    return known.get(text.lower()) or _SPELT.get(text.lower(), text)
 
 
 def scaled_unit(role: str, text: str) -> str:
     """
-    Return a unit of ``t``, ``v`` or ``y`` with the letters of `UNITS`; empty for none.
-
-    A number before it says what one of the file is, or one volt.
+    Return a unit of ``t``, ``v`` or ``y`` with the letters of `UNITS`; empty for other texts.
 
     >>> scaled_unit('y', ' 10 micron/V'), scaled_unit('y', 'um/V'), scaled_unit('v', '20V')
     ('10um/V', '1um/V', '20V')
@@ -171,7 +162,7 @@ def split_unit(text: str) -> tuple[str, str, bool]:
 
 def unit_factor(role: str, unit: str) -> float:
     """
-    Return how many of a unit from `scaled_unit` make one of SI; 1 where none is named.
+    Return the number of a unit from `scaled_unit` in one of SI; 1 for an empty unit.
 
     >>> unit_factor('y', '10um/V'), unit_factor('v', 'mV')
     (100000.0, 1000.0)
@@ -187,7 +178,7 @@ def name_and_unit(name: str) -> tuple[str, str]:
     >>> [name_and_unit(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive')]
     [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive', '')]
     """
-    # of a field of a struct, or a channel of a group, its own name
+    # the own name of a field of a struct, or of a channel of a group
     name = re.sub(PATH, '', name.strip())
     found = _NAMED.fullmatch(name)
     if not found:
@@ -197,7 +188,7 @@ def name_and_unit(name: str) -> tuple[str, str]:
     if found['bare'] is not None:
         # v_min is no time
         return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
-    # what stands in square brackets is a unit, known or not
+    # a text in square brackets is a unit, known or not
     return (found['name'], unit) if known or found['a'] is not None else (name, '')
 
 
@@ -229,9 +220,9 @@ _SPELT = {
 
 def parse_columns(text: str) -> dict[str, str]:
     """
-    Return which column carries what; a part with a comma in it stands in double quotes.
+    Return the column of each quantity; a name with a comma in it stands in double quotes.
 
-    DataError when a part is no pair, or a quantity comes twice.
+    DataError if a part is no pair, or a quantity comes twice.
 
     >>> parse_columns('t=time_s, v=U [V],"y=x, filtered"')
     {'t': 'time_s', 'v': 'U [V]', 'y': 'x, filtered'}

@@ -10,8 +10,8 @@ blocks).  Rows that repeat earlier rows are dropped, unless they start over from
 go on for more than two blocks: a simulation without noise, run again.
 
 Time may be rounded more coarsely than its samples follow each other.  At 5 kHz, stamps in whole
-milliseconds come five at a time.  They still bound the sampling rate, the more closely the longer
-the record is; where only one rate of few digits is left, it is taken.
+milliseconds come five at a time.  Stamps of a long record still bound the sampling rate closely.
+If only one rate of few digits is left, it is taken.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from piezo_ident.record.record import Fault
 
 #: time may jump back in a record only between stretches of at least this many samples
 MIN_STRETCH = 10
-#: by chance, a rate of so few digits lies within the bounds of rounded stamps this seldom
+#: chance at most that a rate of so few digits lies within the bounds of rounded stamps
 CHANCE = 0.1
 #: rows that start over and equal the old ones for longer than this are another run
 MAX_REPEAT = 200
@@ -62,12 +62,12 @@ class OrderedRows:
 
 def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRows, list[int]]:
     """
-    Drop repeated rows, and return the rows at which the clock restarts, with 0.
+    Drop repeated rows, and return the rows at which the clock starts, 0 among them.
 
-    What is met is added to `met`.  DataError when time is unsorted, or has two samples at once.
+    The faults are added to `met`.  DataError if time is unsorted, or has two samples at once.
     """
     n = table.t.size
-    # first what stands right behind its twin, so that the loop below only sees real jumps
+    # first the rows right behind their twins: the loop below then only sees real jumps
     twin = table.t[1:] == table.t[:-1]
     if twin.any():
         for x in table.columns.values():
@@ -97,9 +97,9 @@ def _stretches(
     table: OrderedRows, jumps: Integers, name: str
 ) -> tuple[Integers | None, list[int], Array]:
     """
-    Sort stretches of rising time into repeats and restarts; refuse what is neither.
+    Sort stretches of rising time into repeats and restarts; refuse all others.
 
-    Returns the rows that stay, None for all, where each epoch begins, and the times of repeats.
+    Returns the rows that stay, None for all, the first row of each epoch, and times of repeats.
     """
     t = table.t
     # as long as nothing is dropped, rows are their own numbers and need no table
@@ -107,8 +107,7 @@ def _stretches(
     known = t  # t[rows], so that a look-up copies nothing
     size, begin = 0, 0
     epochs, repeated = [0], []
-    bounds = [0, *jumps.tolist(), t.size]
-    for first, stop in itertools.pairwise(bounds):
+    for first, stop in itertools.pairwise([0, *jumps.tolist(), t.size]):
         start = first
         if size:
             epoch = known[begin:size]
@@ -124,12 +123,11 @@ def _stretches(
             if again and not (from_start and overlap - start > MAX_REPEAT):
                 repeated.append(t[start:overlap])
                 start = overlap
-            elif min(epoch.size, stop - start) >= MIN_STRETCH and (
-                # told in samples, so that gaps do not count
-                has_restarted(float(place[0]), epoch.size, 0.0, 1.0)
+            # counted in samples, so that gaps do not matter
+            elif min(epoch.size, stop - start) >= MIN_STRETCH and has_restarted(
+                float(place[0]), epoch.size, 0.0, 1.0
             ):
-                epochs.append(size)
-                begin = size
+                epochs.append(begin := size)
             elif same_time.any():
                 at = t[start:overlap][same_time][0]
                 raise OrderError(
@@ -148,11 +146,7 @@ def _stretches(
             rows[size : size + stop - start] = np.arange(start, stop)
             known[size : size + stop - start] = t[start:stop]
         size += stop - start
-    return (
-        None if rows is None else rows[:size],
-        epochs,
-        np.concatenate(repeated) if repeated else t[:0],
-    )
+    return None if rows is None else rows[:size], epochs, np.concatenate([t[:0], *repeated])
 
 
 def not_uniform(t: Array, breaks: int, name: str) -> DataError:
@@ -170,7 +164,7 @@ def _mean_rate(t: Array) -> str:
 
 
 def at_times(times: Array) -> str:
-    """Return where something happened, for people: at most three times."""
+    """Return a text with three of some times [s] at most."""
     if not times.size:
         return 'at unknown times'
     text = 'at ' + ', '.join(f'{x:.6g}' for x in times[:3]) + ' s'
@@ -179,25 +173,19 @@ def at_times(times: Array) -> str:
 
 def unrounded(table: OrderedRows, met: list[Fault]) -> Array:
     """
-    Return uniform time where that of a table is rounded too coarsely, else its own.
+    Return uniform time in place of stamps that are rounded too coarsely; other stamps stay.
 
-    What is met is added to `met`.  Repeated rows, lost samples and gaps are left to others: the
-    stamps must all agree with one rate, and be rounded so that steps of two sizes are common.
+    The fault is added to `met`.  The stamps must all agree with one rate, and be rounded so that
+    steps of two sizes are common: repeated rows, lost samples and gaps are met elsewhere.
     """
-    t = table.t
-    n = t.size
+    t, n = table.t, table.t.size
     if n < 10 or not t[-1] > t[0] or not np.all(np.isfinite(t)):
         return t
-    step = np.diff(t)
-    if step.min() < 0:
-        return t
-    again = step == 0
-    if again.any() and all(
+    again, resolution = t[1:] == t[:-1], Resolution.of(t)
+    came_twice = again.any() and all(
         np.array_equal(x[1:][again], x[:-1][again]) for x in table.columns.values()
-    ):
-        return t  # rows that came twice
-    resolution = Resolution.of(t)
-    if resolution.decimals is None:
+    )
+    if (t[1:] < t[:-1]).any() or came_twice or resolution.decimals is None:
         return t
     unit = 10.0**-resolution.decimals
     mean = (t[-1] - t[0]) / (n - 1) / unit
@@ -208,15 +196,12 @@ def unrounded(table: OrderedRows, met: list[Fault]) -> Array:
     if not low <= high:
         return t
     rate = next(nice_rates(low, high))
-    # a rate may be nice by its period
-    digits = min(_digits(rate), _digits(1 / rate))
+    # digits behind the first one, of the rate or of its period
+    digits = next(
+        (d for d in range(15) if any(float(f'{x:.{d}e}') == x for x in (rate, 1 / rate))), 15
+    )
     if (high / low - 1.0) * 10.0**digits > CHANCE:
         return t
     where = f'to {unit:g} s, with {mean:.3g} of it between samples'
     met.append(Fault('rounded_time', where, n, f'read as uniformly sampled at {rate:.9g} Hz'))
     return time_stamps(rate, round(t[0] * rate) / rate, 0, n)
-
-
-def _digits(x: float) -> int:
-    """Return how many digits behind the first one a number has."""
-    return next((d for d in range(15) if float(f'{x:.{d}e}') == x), 15)

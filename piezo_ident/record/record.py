@@ -2,17 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What was measured: voltage, displacement, time and named segments.
+A record: measured voltage, displacement, time and named segments.
 
-A record is a list of uniformly sampled pieces.  Wherever time jumps, the rate changes or a
-sample is unusable, a new piece begins, because the stage's memory at its start is unknown.  Where
-the displacement alone is unusable, the new piece keeps the voltage that was played meanwhile.
+A record is a list of uniformly sampled pieces.  A new piece begins wherever time jumps, the rate
+changes or a sample is unusable, because the stage's memory at its start is unknown.  If the
+displacement alone is unusable, the new piece keeps the voltage that was played meanwhile.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import itertools
 from types import MappingProxyType
 from typing import Any
 
@@ -24,18 +25,8 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
 
 #: the segment kinds that the programs use; other labels are kept and treated as unlabelled
-KINDS = (
-    'step',
-    'settle',
-    'noise',
-    'triangle',
-    'sine',
-    'hold',
-    'staircase',
-    'multisine',
-    'ramp',
-    'idle',
-)
+KINDS = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase', 'multisine')
+KINDS += ('ramp', 'idle')
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,7 @@ class Fault:
 
     @property
     def is_note(self) -> bool:
-        """Whether nothing was wrong, as where columns were told by their names."""
+        """Whether nothing was wrong: the note names the columns that were read."""
         return self.name == 'columns'
 
     def __str__(self) -> str:
@@ -94,15 +85,15 @@ class Piece:
     channels : mapping of str to array_like, shape (n,)
         Further measured signals, for example temperature or another axis's voltage.
     before : Piece, optional
-        The samples right before, of which everything but the displacement is known.
+        The samples right before, whose displacement alone is unknown.
     sound : array_like of bool, shape (n,), optional
-        False where a reading was no displacement of the stage, and a straight line stands in for
-        it; see `piezo_ident.record.readings.faults.without_faults`.  None before that was judged.
+        False for a reading that was no displacement of the stage, and that a straight line
+        replaces; see `piezo_ident.record.readings.faults.without_faults`.  None: not yet judged.
 
     Raises
     ------
     DataError
-        When lengths differ, the piece is empty, or the rate is not positive.
+        If lengths differ, the piece is empty, or the rate is not positive.
     """
 
     v: Array
@@ -145,12 +136,12 @@ class Piece:
 
     @property
     def mask(self) -> Mask:
-        """The samples whose displacement counts, shape (n,)."""
+        """True for samples whose displacement counts, shape (n,)."""
         return np.ones(self.n, dtype=bool) if self.sound is None else self.sound
 
     @property
     def measured(self) -> Array:
-        """The displacement [m], NaN where it does not count, shape (n,)."""
+        """The displacement [m], NaN for samples that do not count, shape (n,)."""
         return self.y if self.sound is None else np.where(self.sound, self.y, np.nan)
 
     @property
@@ -177,11 +168,7 @@ class Piece:
         return [s for s in self.segments if kind in (s.kind, s.label)]
 
     def cut(self, start: int, stop: int) -> Piece:
-        """
-        Return samples ``start`` to ``stop - 1`` as a piece of its own, segments included.
-
-        DataError when the range is empty or leaves the piece.
-        """
+        """Return samples ``start`` to ``stop - 1``, segments included; DataError for others."""
         if not 0 <= start < stop <= self.n:
             raise DataError(f'cannot cut samples {start}..{stop} out of a piece of {self.n}')
         segments = tuple(
@@ -202,9 +189,9 @@ class Piece:
 
     def without(self, runs: Iterable[tuple[int, int]]) -> list[Piece]:
         """
-        Return what is left without the displacement of samples ``start`` to ``stop - 1`` of runs.
+        Return the parts between runs whose displacement, from start to stop - 1, is unusable.
 
-        Each part behind a run keeps its voltage and channels; a lone sample is no part.
+        Each part keeps the voltage and channels of the run before it; a lone sample is no part.
         """
         marks = [0, *(mark for run in runs for mark in run), self.n]
         if len(marks) == 2:
@@ -226,12 +213,7 @@ class Piece:
 @dataclass(frozen=True, eq=False, repr=False)
 class Record(Showable):
     """
-    One measurement: pieces in order of time, and what was wrong with the data.
-
-    Raises
-    ------
-    DataError
-        When there is no piece.
+    One measurement: pieces in order of time, one at least, and the faults of the data.
 
     Examples
     --------
@@ -265,7 +247,7 @@ class Record(Showable):
         name: str = 'record',
     ) -> Record:
         """
-        Return the record of measured arrays, checked as those of a file are.
+        Return the record of measured arrays, checked as the columns of a file are.
 
         Parameters
         ----------
@@ -273,9 +255,9 @@ class Record(Showable):
             ``t, v, y``, or ``v, y`` with a `sample_rate`: time [s], voltage [V], and displacement
             [`displacement_unit`].
         sample_rate : float, optional
-            Samples a second [Hz]; with `t` the rate that its stamps must agree with.
+            Samples a second [Hz]; stamps `t` must agree with it.
         segments : tuple of (names, starts), optional
-            Label of each stretch and the sample at which it begins; an empty label means none.
+            Label and first sample of each stretch; an empty label means none.
         channels : mapping of str to array_like, shape (n,), optional
             Further measured signals.
         displacement_unit : {'m', 'mm', 'um', 'nm'}
@@ -291,7 +273,7 @@ class Record(Showable):
         Raises
         ------
         DataError
-            When the arrays cannot be used.
+            If the arrays cannot be used.
 
         Examples
         --------
@@ -329,17 +311,11 @@ class Record(Showable):
 
     @property
     def is_measured(self) -> bool:
-        """Whether the displacement is known; it is NaN where a voltage alone was read."""
+        """Whether the displacement is known; it is NaN if a voltage alone was read."""
         return not np.isnan(self.pieces[0].y[0])
 
     def require_displacement(self) -> None:
-        """
-        Refuse a record of voltage alone.
-
-        Raises
-        ------
-        DataError
-        """
+        """Raise DataError for a record of voltage alone."""
         if not self.is_measured:
             raise DataError(
                 f'{self.name}: holds a voltage and no displacement; only a prediction can use it'
@@ -366,15 +342,15 @@ class Record(Showable):
         return [p.cut(s.start, s.stop) for p in self for s in p.find(kind)]
 
     def first(self, n: int) -> Record:
-        """Return the first n samples, and say so in the faults; the same record if it is short."""
+        """Return the first n samples, which a fault names; the same record if it is short."""
         if self.n <= n:
             return self
-        pieces: list[Piece] = []
-        left = n
-        for piece in self.pieces:
-            if left > 0:
-                pieces.append(piece.cut(0, min(left, piece.n)))
-                left -= pieces[-1].n
+        starts = itertools.accumulate((piece.n for piece in self), initial=0)
+        pieces = (
+            p.cut(0, min(n - start, p.n))
+            for p, start in zip(self, starts, strict=False)
+            if start < n
+        )
         part = replace(self, pieces=tuple(pieces))
         where = f'{part.duration:.6g} of {self.duration:.6g} s are used'
         fault = Fault('part', where, self.n - n, 'what comes later is left out')
@@ -386,7 +362,7 @@ class Record(Showable):
 
 
 def records_of(records: Record | Iterable[Record], where: str) -> list[Record]:
-    """Return one record, or several, as a list; DataError when something else is given."""
+    """Return one record, or several, as a list; DataError for anything else."""
     single = isinstance(records, (Record, str)) or not isinstance(records, Iterable)
     several: list[Any] = [records] if single else list(records)
     for record in several:

@@ -4,8 +4,8 @@
 """
 The blocks of one topic as they come, in buffers that a copy shares.
 
-The samples of a long bag are spooled to temporary files, and read back as memory maps.  A record
-of an hour then needs no memory of its own, and is an ordinary array to the rest of the package.
+Samples of a long bag move to temporary files, and are read back as memory maps.  A record of an
+hour then needs no memory of its own, and is an ordinary array to the rest of the package.
 """
 
 from __future__ import annotations
@@ -27,23 +27,10 @@ SPOOLED = 1 << 21
 
 class BlockStream:
     """
-    All blocks of one topic so far; nothing that was added ever changes, so copies share it.
+    All `n` samples of one topic so far; added blocks never change, so copies share them.
 
-    Parameters
-    ----------
-    spooled : bool, optional
-        Move the samples to temporary files whenever there are more than `SPOOLED`.  Such a stream
-        can be neither copied nor shortened.
-
-    Attributes
-    ----------
-    n : int
-        Number of samples.
-
-    Raises
-    ------
-    DataError
-        When there is no room for the temporary files.
+    A `spooled` stream moves its samples to temporary files whenever there are more than `SPOOLED`;
+    it can be neither copied nor shortened.  DataError if there is no room for these files.
     """
 
     def __init__(self, *, spooled: bool = False) -> None:
@@ -86,7 +73,7 @@ class BlockStream:
         return other
 
     def drop(self, n: int) -> int:
-        """Forget the oldest blocks, at least so many samples; return how many it were."""
+        """Forget the oldest blocks, at least `n` samples; return the number of samples."""
         ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
         blocks = int(np.searchsorted(ends, n)) + 1 if n > 0 else 0
         gone = left = int(ends[:blocks].max(initial=0))
@@ -107,12 +94,12 @@ class BlockStream:
 
     @property
     def times(self) -> Array:
-        """Time of each sample [s], shape (n,): a copy, or a read-only memory map."""
+        """Time of each sample [s], shape (n,): a copy, or a memory map of a spooled stream."""
         return self._column(0)
 
     @property
     def values(self) -> Array:
-        """Value of each sample, shape (n,): a copy, or a read-only memory map."""
+        """Value of each sample, shape (n,): a copy, or a memory map of a spooled stream."""
         return self._column(1)
 
     def _spool(self) -> None:
@@ -140,17 +127,17 @@ class BlockStream:
 
     @property
     def arrivals(self) -> Integers:
-        """When each sample arrived [ns]."""
+        """Time of arrival of each sample [ns]."""
         return np.repeat(np.array(self._arrivals, dtype=np.int64), self._sizes)
 
     def arrived(self, rows: Integers) -> Integers:
-        """Return when some samples arrived [ns]."""
+        """Return the times of arrival of some samples [ns]."""
         ends = np.cumsum(np.array(self._sizes, dtype=np.int64))
         block = np.searchsorted(ends, rows, 'right')
         return np.array(self._arrivals, dtype=np.int64)[block]
 
     def labels(self) -> tuple[list[str], Integers]:
-        """Return the label of each stretch, and the row where it begins."""
+        """Return the label and the first row of each stretch."""
         names: list[str] = []
         starts: list[int] = []
         row = 0
@@ -164,7 +151,7 @@ class BlockStream:
 
 class LossCount:
     """
-    Counts what is missing in the numbers of a topic's messages, of one publisher or several.
+    Counts the messages that are lost of a topic, by their numbers.
 
     >>> losses = LossCount()
     >>> for number in (7, 8, 1, 9, 2, 5):
@@ -173,7 +160,7 @@ class LossCount:
     2
     """
 
-    #: among several publishers a larger gap is another one, joined late
+    #: a larger gap between numbers is another publisher that joined late
     GAP = 1000
 
     def __init__(self) -> None:
@@ -181,7 +168,7 @@ class LossCount:
         self._last: list[int] = []
 
     def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of a number; `alone`: of who gave the one before, and is the only one."""
+        """Take note of a number; `alone` if one publisher gave all numbers so far."""
         before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Everything that the pictures of a residual show, in one result."""
+"""One result with everything that the pictures of a residual show."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
 @dataclass(frozen=True, eq=False)
 class ResidualAnalysis:
-    """Noise floor, lines, curves and coherence of a residual; the parts are as they were given."""
+    """Noise floor, lines, curves and coherence of the residual of some parts."""
 
     parts: tuple[ResidualPart, ...]
     floor: NoiseFloor
@@ -30,13 +30,12 @@ class ResidualAnalysis:
 
 def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     """
-    Look at the residual of a model from every side.
+    Analyse the residual of a model without its outliers and clipped readings.
 
-    Faults of the data come first: outliers and clipped readings are left out before anything else
-    is read from the residual.  DataError when there is no sound sample.
+    DataError if there is no sound sample.
     """
     if not any(part.mask.any() for part in parts):
-        raise DataError('there is no sound sample whose residual could be looked at')
+        raise DataError('no sample of the residual is sound; give a record with sound samples')
     faults = find_faults(parts)
     clean = [
         ResidualPart(p.record, p.piece, p.e, p.mask & ~bad)

@@ -16,35 +16,35 @@ from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
-#: rate of the means that are looked at [Hz]
+#: rate of the tested means [Hz]
 RATE = 2500.0
 #: plays of the drive, and of a channel, as shares of the range
 PLAYS, CHANNEL_PLAYS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.9), (0.1, 0.4)
 #: corners of the low-passes behind each function [Hz]
 CORNERS = (0.3, 2.0, 10.0, 50.0, 250.0)
-#: share of a direction below which it is rounding
+#: least share of a direction among functions, beyond rounding
 RANK, CHANNEL_RANK = 1e-6, 1e-3
-#: half waves over a record that count as drift, and start that is still settling [s]
+#: half waves over a record that count as drift, and settling time at its start [s]
 SLOW, SETTLING = 24, 0.5
-#: share of a channel that the drive must leave, and of its power that may be coherent with it
+#: least share of a channel beyond the drive, and largest coherent share of its power
 OWN, FOLLOWS = 0.01, 0.9
 #: coefficients of the filter that makes a residual white, and the window of its level [s]
 WHITE, LEVEL = 32, 0.1
-#: chance of an unrelated channel that is taken for a cause
+#: chance that an unrelated channel is taken for a cause
 SIGNIFICANT = 1e-5
-#: share of the gain that must be left where it was not fitted, and parts held out in turn
+#: least share of the gain in parts that are held out of the fit, and number of these parts
 KEPT, FOLDS = 0.5, 5
-#: shifts by less than this share of a record are not used as surrogates
+#: least shift of a surrogate, as a share of a record
 AROUND = 0.05
 
 
 @dataclass(frozen=True)
 class ChannelTest:
     """
-    Whether a further channel explains what the drive leaves of a residual.
+    Whether a further channel explains a residual beyond the drive.
 
-    A channel without a bearing on the residual is `significant` in one of 100,000 cases; `added`
-    is what it adds to the residual of each part [m], empty when it was not tested.
+    An unrelated channel is `significant` in one of 100,000 cases; `added` is its contribution to
+    the residual of each part [m], empty without a test.
     """
 
     channel: str
@@ -59,11 +59,11 @@ class ChannelTest:
 
 def drive_functions(v: Array, rate: float) -> Array:
     """
-    Return functions of a drive that a hysteresis, a lag or a creep may be made of, shape (n, k).
+    Return functions of a drive that may sum up to a hysteresis, a lag or a creep, shape (n, k).
 
-    The drive v, shape (n,), its square and cube, and plays of it, each with its first and second
-    difference and behind low-passes.  No sum of plays is a real hysteresis: the pairs with the
-    square let its loops lean.
+    The functions are the drive v, shape (n,), its square and cube, its plays, and the plays times
+    the drive, which let loops lean.  Each comes with its first and second difference, and behind
+    low-passes.
     """
     span = float(np.ptp(v))
     u = (v - v.min()) / span if span > 0.0 else np.zeros(v.size)
@@ -83,25 +83,25 @@ def without_drive(e: Array, v: Array, rate: float, use: Mask) -> Array:
 
 
 def _slow(n: int) -> Array:
-    """Return what is slower than a channel can be told from drift and creep, shape (n, k)."""
+    """Return slow functions of time that stand for drift and creep, shape (n, k)."""
     return np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(SLOW)))
 
 
 def _solve(A: Array, e: Array) -> Array:
-    """Return the least squares of columns (n, k), directions that are rounding left out."""
+    """Return the least-squares coefficients of columns (n, k), without directions of rounding."""
     scale, values, vectors = _directions(A, RANK**1.5)
     return np.asarray(vectors @ ((vectors.T @ (A.T @ e / scale)) / values) / scale)
 
 
 def _basis(A: Array, rank: float) -> tuple[Array, Array]:
-    """Return an orthonormal basis of columns (n, k), and the combinations that make it."""
+    """Return an orthonormal basis of columns (n, k), and its combinations of the columns."""
     scale, values, vectors = _directions(A, rank)
     made = vectors / np.sqrt(values) / scale[:, None]
     return A @ made, made
 
 
 def _directions(A: Array, rank: float) -> tuple[Array, Array, Array]:
-    """Return the sizes of columns, and what their products have above a share of the largest."""
+    """Return the sizes of columns, and the larger eigenvalues of their products with vectors."""
     N = A.T @ A
     scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
     values, vectors = linalg.eigh(N / scale / scale[:, None])
@@ -121,24 +121,20 @@ class _Part:
     rate: float
 
     def beyond(self, x: Array, channel: Array | None = None) -> Array:
-        """Return a signal without what the drive, and a channel, explain of it."""
+        """Return a signal less its best functions of the drive, and of a channel."""
         A = self.drive if channel is None else np.hstack([self.drive, channel])
         return np.asarray(x - A @ _solve(A[self.use], x[self.use]))
 
 
 def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
     """
-    Return for every further channel of records what it explains that the drive cannot.
+    Test every further channel of records for a share in the residual beyond the drive.
 
     Functions of the drive (`drive_functions`) are subtracted from residual and channel.  Both are
     divided by the level of the residual nearby, so that quiet stretches count, and made white.
     The channel, its plays and its low-passes then explain a share of the residual.  Circular
-    shifts of the residual tell the share that an unrelated channel explains.
-
-    Notes
-    -----
-    Partial coherence: Bendat and Piersol, Random Data, 4th ed. (2010), section 7.3,
-    doi:10.1002/9781118032428.
+    shifts of the residual give the share of an unrelated channel.  Partial coherence: Bendat and
+    Piersol, Random Data, 4th ed. (2010), section 7.3, doi:10.1002/9781118032428.
     """
     names = dict.fromkeys(name for part in parts for name in part.piece.channels)
     return tuple(_tested(name, parts) for name in names)
@@ -146,10 +142,7 @@ def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
 
 def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     having = [part for part in parts if name in part.piece.channels]
-    every = [
-        _part_of(part, part.piece.channels[name]) if name in part.piece.channels else None
-        for part in parts
-    ]
+    every = [_part_of(part, name) if name in part.piece.channels else None for part in parts]
     rate = max((p.rate for p in every if p), default=0.0)
     found = [p for p in every if p and p.rate == rate and p.use.sum() > 4 * WHITE]
     moves = any(np.ptp(p.own[p.use]) > 0.0 for p in found)
@@ -169,53 +162,42 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     chance, gain, bound = _chance(E, P)
     kept = _held_out(E, P) / max(float(np.sum((P.T @ E) ** 2)), 1e-300)
     coefficients = made @ (P.T @ E)
-    of_part = {id(p): p.channel @ coefficients for p in found}
-    return ChannelTest(
-        channel=name,
-        significant=chance < SIGNIFICANT and gain > bound and kept > KEPT,
-        added=tuple(
-            None if p is None or id(p) not in of_part else _at_all(part, of_part[id(p)])
-            for part, p in zip(parts, every, strict=True)
-        ),
-    )
+    added: list[Array | None] = []
+    for part, p in zip(parts, every, strict=True):
+        added.append(None)
+        if any(p is one for one in found) and p is not None:
+            m = max(1, int(part.piece.sample_rate / RATE))
+            means = p.channel @ coefficients
+            middle = np.arange(means.size) * m + 0.5 * (m - 1)
+            added[-1] = np.interp(np.arange(part.piece.n), middle, means - means.mean())
+    is_cause = chance < SIGNIFICANT and gain > bound and kept > KEPT
+    return ChannelTest(name, is_cause, tuple(added))
 
 
 def without_channels(
     parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
 ) -> list[ResidualPart]:
-    """Subtract what significant channels add, so that lines of a channel do not pass for hum."""
-    # the voltage and the displacement of one axis tell the same, and each was tested alone
+    """Subtract the contributions of significant channels; their lines then pass for no hum."""
+
+    def squares(parts: Sequence[ResidualPart]) -> float:
+        return sum(float(np.sum(part.e[part.mask] ** 2)) for part in parts)
+
+    # voltage and displacement of one axis explain the same, and each was tested alone
     of_axis: dict[str, list[list[ResidualPart]]] = {}
     for t in tests:
         if t.significant:
             axis = t.channel[2:] if role_of(t.channel) else t.channel
-            of_axis.setdefault(axis, []).append(_without(parts, t))
+            pairs = zip(parts, t.added, strict=True)
+            rest = [part if x is None else part.with_residual(part.e - x) for part, x in pairs]
+            of_axis.setdefault(axis, []).append(rest)
     found = list(parts)
     for rivals in of_axis.values():
-        least = min(rivals, key=_squares)
+        least = min(rivals, key=squares)
         found = [
             part.with_residual(part.e + less.e - own.e)
             for part, less, own in zip(found, least, parts, strict=True)
         ]
     return found
-
-
-def _without(parts: Sequence[ResidualPart], test: ChannelTest) -> list[ResidualPart]:
-    return [
-        part if x is None else part.with_residual(part.e - x)
-        for part, x in zip(parts, test.added, strict=True)
-    ]
-
-
-def _squares(parts: Sequence[ResidualPart]) -> float:
-    return sum(float(np.sum(part.e[part.mask] ** 2)) for part in parts)
-
-
-def _at_all(part: ResidualPart, means: Array) -> Array:
-    """Return means over blocks at every sample."""
-    m = max(1, int(part.piece.sample_rate / RATE))
-    middle = np.arange(means.size) * m + 0.5 * (m - 1)
-    return np.asarray(np.interp(np.arange(part.piece.n), middle, means - means.mean()))
 
 
 def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) -> bool:
@@ -227,29 +209,26 @@ def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) 
     return left < OWN * whole or (of_drive is not None and of_drive.share > FOLLOWS)
 
 
-def _part_of(part: ResidualPart, channel: Array) -> _Part:
+def _part_of(part: ResidualPart, name: str) -> _Part:
+    """Return the means of a part, with functions of channel `name`."""
     m = max(1, int(part.piece.sample_rate / RATE))
     rate = part.piece.sample_rate / m
-    e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, np.asarray(channel, np.float64)))
+    e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, part.piece.channels[name]))
     use = part.joined[: e.size * m].reshape(-1, m).all(axis=1) & np.isfinite(c)
     use[: min(round(SETTLING * rate), e.size // 8)] = False
     c = _known(c)
     drive = np.hstack([drive_functions(v, rate), _slow(e.size)])
-    functions = _channel_functions(c, rate)
+    # a stage may follow a channel itself, late, fast, and with a hysteresis of its own
+    span = float(np.ptp(c))
+    u = (c - c[0]) / span if span > 0.0 else np.zeros(c.size)
+    columns = [u, np.diff(u, prepend=u[0]), *play_columns(u - u.min(), CHANNEL_PLAYS)]
+    functions = np.stack([*columns, *_lagged(u, rate, CORNERS[1:])], axis=1)
     return _Part(np.where(use, e, 0.0), drive, functions, c, use, rate)
 
 
 def _known(channel: Array) -> Array:
-    """Return a channel with straight lines for what is not known of it."""
+    """Return a channel with straight lines for its unknown samples."""
     return interpolated(channel, ~np.isfinite(channel))
-
-
-def _channel_functions(c: Array, rate: float) -> Array:
-    """Return what a channel may move: itself, late, fast, and with a hysteresis of its own."""
-    span = float(np.ptp(c))
-    u = (c - c[0]) / span if span > 0.0 else np.zeros(c.size)
-    columns = [u, np.diff(u, prepend=u[0]), *play_columns(u - u.min(), CHANNEL_PLAYS)]
-    return np.stack([*columns, *_lagged(u, rate, CORNERS[1:])], axis=1)
 
 
 def _lagged(x: Array, rate: float, corners: Sequence[float] = CORNERS) -> list[Array]:
@@ -273,7 +252,7 @@ def _level(p: _Part) -> Array:
 
 def _white(x: Array, p: _Part, level: Array, white: Array) -> Array:
     """Return signals (n, k) at one level and white, at samples that count."""
-    # where the filter starts, and behind samples that do not count, all looks like a jump
+    # the start of the filter, and samples behind those that do not count, look like a jump
     settled = np.convolve(p.use.astype(np.float64), np.ones(white.size))[: p.use.size]
     whitened = signal.lfilter(white, [1.0], x / level[:, None], axis=0)
     return np.asarray(whitened[settled > white.size - 0.5])
@@ -291,7 +270,7 @@ def _whitening(e: Array) -> Array:
 
 
 def _held_out(e: Array, P: Array) -> float:
-    """Return the gain in squares of stretches that were not fitted, equal motion in each."""
+    """Return the gain in squares of held-out stretches with equal motion."""
     moved = np.cumsum(np.sum(P**2, axis=1))
     edges = np.searchsorted(moved, np.linspace(0.0, moved[-1], FOLDS + 1)[1:-1])
     total = 0.0
@@ -306,16 +285,16 @@ def _chance(e: Array, P: Array) -> tuple[float, float, float]:
     """
     Return the chance of a gain, the gain as a share of e, and its bound.
 
-    The surrogates are all circular shifts of e, without what the columns of P explain of it,
-    against those columns.  Their gains are coherences, so a beta distribution of their mean and
-    variance goes on where their number ends.
+    The surrogates are all circular shifts of e, less its projection on the columns of P, against
+    those columns.  Their gains are coherences: a beta distribution of their mean and variance
+    gives smaller chances than their number.
     """
     n, k = P.shape
     power = float(e @ e)
     if power == 0.0 or k == 0:
         return 1.0, 0.0, 1.0
     size = fft.next_fast_len(n, real=True)
-    # the shifts of a series that is filled up with zeros are as good
+    # zeros behind a series do its shifts no harm
     rest = e - P @ (P.T @ e)
     E = np.conj(fft.rfft(rest, size))
     gains = np.zeros(size)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Spectra of two signals, and whether a residual follows the voltage: coherence, with a bound."""
+"""Spectra of two signals, and the coherence of voltage and residual, with a bound."""
 
 from __future__ import annotations
 
@@ -17,32 +17,24 @@ from scipy import fft, signal
 
 #: samples whose segments are transformed at once
 TOGETHER = 1 << 18
-#: of the bound
+#: confidence of the bound
 CONFIDENCE = 0.99
-#: averages asked of a coherence, longest segment [samples]
+#: averages of a coherence, longest segment [samples]
 AVERAGES, SEGMENT = 32, 8192
-#: share of the input's largest density below which there is no input to cohere with
+#: least density of an input, as a share of its largest density
 EXCITED = 1e-7
-#: independent averages in one that overlaps by half, with a Hann window
+#: independent averages in each Hann segment that overlaps by half
 OVERLAP = 1.0 / 1.056
 
 
 @dataclass(frozen=True, eq=False)
 class Coherence:
     """
-    Coherence of voltage and residual.
+    Coherence ``|S_ve|^2 / (S_vv S_ee)`` of voltage and residual over frequency [Hz], shapes (p,).
 
-    Attributes
-    ----------
-    frequency, coherence : ndarray, shape (p,)
-        [Hz], and ``|S_ve|^2 / (S_vv S_ee)``.
-    tested : ndarray of bool, shape (p,)
-        Frequencies at which the voltage has power.
-    bound : float
-        ``1 - (1 - c)^(1/(L - 1))`` of L independent averages: unrelated signals stay below it in
-        a share c of cases.
-    share : float
-        Share of the residual's power that is coherent with the voltage, bias taken away.
+    `tested` are the frequencies at which the voltage has power.  The bound is
+    ``1 - (1 - c)^(1/(L - 1))`` of L independent averages: unrelated signals stay below it in a
+    share c of cases.  `share` is the coherent share of the residual's power, without bias.
     """
 
     frequency: Array
@@ -58,9 +50,8 @@ def cross_spectra(
     """
     Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
 
-    The Hann segments of some size, at most n, overlap by half; a line is taken out of each, or
-    without `linear` its mean.  The sums, shape (size // 2 + 1,), have no unit: only ratios of them
-    tell anything.
+    The Hann segments of some size, at most n, overlap by half.  Each loses its line, or its mean
+    without `linear`.  The sums, shape (size // 2 + 1,), have no unit: only their ratios count.
     """
     window, step = signal.get_window('hann', size), size - size // 2
     segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]
@@ -83,30 +74,23 @@ def _detrended(x: Array, linear: bool) -> Array:
     return np.asarray(x - slope * t) if linear else x
 
 
-def _chosen(parts: Sequence[ResidualPart]) -> tuple[list[ResidualPart], float]:
-    """Return the parts of the rate at which most was sampled."""
+def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
+    """
+    Return the coherence of voltage and residual by Welch's method; None for short records.
+
+    Parts of the rate with most samples are used.  Bendat and Piersol, Random Data, 4th ed. (2010),
+    section 9.2, doi:10.1002/9781118032428.
+    """
     rates: Counter[float] = Counter()
     for part in parts:
         rates[part.piece.sample_rate] += part.piece.n
     rate = max(rates, key=rates.__getitem__, default=1.0)
-    return [p for p in parts if abs(p.piece.sample_rate / rate - 1.0) < 1e-6], rate
-
-
-def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
-    """
-    Return the coherence of voltage and residual by Welch's method; None when too short.
-
-    Notes
-    -----
-    Bendat and Piersol, Random Data, 4th ed. (2010), section 9.2, doi:10.1002/9781118032428.
-    """
-    chosen, rate = _chosen(parts)
+    chosen = [p for p in parts if abs(p.piece.sample_rate / rate - 1.0) < 1e-6]
     runs = [(p, a, b) for p in chosen for a, b in p.runs()]
     total = sum(b - a for _, a, b in runs)
     if total < 256:
         return None
-    n = int(2 ** np.floor(np.log2(max(64, 2 * total // AVERAGES))))
-    n = min(n, SEGMENT)
+    n = min(int(2 ** np.floor(np.log2(max(64, 2 * total // AVERAGES)))), SEGMENT)
     long = [(p.piece.v[a:b], p.e[a:b]) for p, a, b in runs if b - a >= n]
     count = sum(1 + (v.size - n) // (n // 2) for v, _ in long)
     if count < 4:
@@ -116,7 +100,7 @@ def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
     tiny = np.finfo(float).tiny
     c = np.clip(np.abs(ve) ** 2 / np.maximum(vv * ee, tiny), 0.0, 1.0)
     tested = vv > EXCITED * float(vv.max())
-    # the first bins are what detrending left
+    # detrending leaves little in the first bins
     tested[:2] = False
     bound = 1.0 - (1.0 - CONFIDENCE) ** (1.0 / (averages - 1.0))
     unbiased = np.clip((c - 1.0 / averages) / (1.0 - 1.0 / averages), 0.0, 1.0)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""On what a residual depends: its mean over voltage, speed, and time since a step."""
+"""Mean residual over voltage, speed, and time since a step."""
 
 from __future__ import annotations
 
@@ -14,28 +14,22 @@ from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 
 #: samples after averaging, bins of a curve, bins a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
-#: stretches of time that count as independent: so many, but none shorter than this [s]
+#: independent stretches of time: so many, of this length at least [s]
 CHUNKS, CHUNK_TIME = 120, 0.05
-#: fewest samples and chunks of a bin that is shown
+#: fewest samples and stretches of time in a shown bin
 FEWEST, VISITS = 8, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
     """
-    Mean residual over bins of one quantity.
+    Mean residual over bins of one quantity, 'v', 'dv/dt' or 'time since the step'.
 
-    Attributes
-    ----------
-    against : {'v', 'dv/dt', 'time since the step'}
-    branch : {'up', 'down', 'both'}
-        Direction of the drive.  'both': the residual is multiplied by the step as a share of the
-        largest step, so that upward and downward steps add up.
-    x : ndarray, shape (m,)
-        Mean of the quantity in each bin.
-    mean, std : ndarray, shape (m,)
-        Mean residual and its standard deviation [m]; whole stretches of time count as one
-        observation, so correlated samples do not make it look better known than it is.
+    The branch is the direction of the drive, 'up', 'down' or 'both'.  The residual of 'both' is
+    multiplied by the step as a share of the largest step: upward and downward steps add up.  `x`
+    are the means of the quantity in each bin, `mean` and `std` the mean residual and its standard
+    deviation [m], shapes (m,).  A whole stretch of time is one observation, as its samples are
+    correlated.
     """
 
     against: str
@@ -45,92 +39,49 @@ class Curve:
     std: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """Averaged samples of the motions."""
-
-    e: Array
-    v: Array
-    speed: Array
-    direction: Array
-    chunk: Integers
-
-
 #: of a hold: bins of time, mean residual in each, step as a share of the largest
 _Hold = tuple[Integers, Array, float]
 
 
 def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
-    """
-    Return the mean residual over v, dv/dt, and the time since the last step.
-
-    Quantities without data have no curve.
-    """
-    found: list[Curve] = []
-    motion = _motions(parts, stretches)
-    if motion is not None:
-        found += _against_v(motion)
-        found += _against_speed(motion)
-    found += _since_step(parts, stretches)
-    return tuple(found)
+    """Return the mean residual over v, dv/dt, and the time since the last step, as data allow."""
+    return (*_of_motions(parts, stretches), *_since_step(parts, stretches))
 
 
-def _motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> _Motion | None:
+def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
+    """Return the mean residual over v and dv/dt, for both directions of the motions."""
     moving = [s for s in stretches if s.kind != 'rest']
-    total = sum(s.n for s in moving)
-    if total == 0:
-        return None
-    m = max(1, -(-total // SAMPLES))
-    columns: list[list[Array]] = [[] for _ in range(4)]
-    chunks: list[Integers] = []
+    if not moving:
+        return []
+    m = max(1, -(-sum(s.n for s in moving) // SAMPLES))
     seconds = sum(s.n / parts[s.part].piece.sample_rate for s in moving)
     chunk_time = max(CHUNK_TIME, seconds / CHUNKS)
+    columns: list[list[Array]] = []
+    chunks: list[Integers] = []
     number = 0
     for s in moving:
-        piece, rate = parts[s.part].piece, parts[s.part].piece.sample_rate
-        v = piece.v[s.start : s.stop]
-        speed = np.gradient(v) * rate
-        averaged = [block_means(x, m) for x in (parts[s.part].e[s.start : s.stop], v, speed)]
-        direction = np.sign(averaged[2])
-        for column, x in zip(columns, (*averaged, direction), strict=True):
-            column.append(x)
-        chunk = np.arange(averaged[0].size) * m / rate // chunk_time
+        part, rate = parts[s.part], parts[s.part].piece.sample_rate
+        v = part.piece.v[s.start : s.stop]
+        signals = part.e[s.start : s.stop], v, np.gradient(v) * rate
+        columns.append([block_means(x, m) for x in signals])
+        chunk = np.arange(columns[-1][0].size) * m / rate // chunk_time
         chunks.append(number + chunk.astype(np.int64))
         number = int(chunks[-1][-1]) + 1 if chunk.size else number
-    e, v, speed, direction = (np.concatenate(column) for column in columns)
-    return _Motion(e, v, speed, direction, np.concatenate(chunks))
-
-
-def _against_v(motion: _Motion) -> list[Curve]:
-    ends = np.linspace(motion.v.min(), motion.v.max() + 1e-12, BINS + 1)
-    bins = np.clip(np.searchsorted(ends, motion.v, side='right') - 1, 0, BINS - 1)
-    bins = bins + BINS * (motion.direction < 0.0)
-    return [
-        _curve('v', branch, motion.v, motion.e, bins, motion.chunk, own)
-        for branch, own in (('up', motion.direction > 0.0), ('down', motion.direction < 0.0))
-    ]
-
-
-def _against_speed(motion: _Motion) -> list[Curve]:
+    e, v, speed = (np.concatenate(column) for column in zip(*columns, strict=True))
+    visits = np.concatenate(chunks)
+    ends = np.linspace(v.min(), v.max() + 1e-12, BINS + 1)
+    bins = np.clip(np.searchsorted(ends, v, side='right') - 1, 0, BINS - 1)
+    ways = (('up', speed > 0.0), ('down', speed < 0.0))
+    found = [_curve('v', branch, v, e, bins, visits, own) for branch, own in ways]
     # speeds span decades, and a triangle has only one
-    moving = np.abs(motion.speed) > 1e-6 * np.abs(motion.speed).max()
-    if moving.sum() < 4 * BINS:
-        return []
-    bins = np.zeros(motion.speed.size, dtype=np.int64)
-    bins[moving] = _decades(np.abs(motion.speed[moving]))
-    bins = 2 * bins + (motion.speed < 0.0)
-    return [
-        _curve('dv/dt', branch, motion.speed, motion.e, bins, motion.chunk, own)
-        for branch, own in (
-            ('up', moving & (motion.speed > 0.0)),
-            ('down', moving & (motion.speed < 0.0)),
-        )
-    ]
-
-
-def _decades(t: Array) -> Integers:
-    k = np.floor(PER_DECADE * np.log10(t)).astype(np.int64)
-    return np.asarray(k - k.min())
+    moves = np.abs(speed) > 1e-6 * np.abs(speed).max()
+    if moves.sum() >= 4 * BINS:
+        decades = np.full(speed.size, np.inf)
+        decades[moves] = np.floor(PER_DECADE * np.log10(np.abs(speed[moves])))
+        bins = np.where(moves, decades - decades.min(), 0.0).astype(np.int64)
+        for branch, own in ways:
+            found.append(_curve('dv/dt', branch, speed, e, bins, visits, own & moves))
+    return found
 
 
 def _curve(
@@ -142,7 +93,7 @@ def _curve(
     filled = np.maximum(count, 1)
     centre = np.bincount(bins, x, size) / filled
     mean = np.bincount(bins, e, size) / filled
-    # a stretch of time enters with the sum of what it brings to a bin
+    # a stretch of time enters with its sum in a bin
     pair, visit = np.unique(bins * (int(chunk.max(initial=0)) + 1) + chunk, return_inverse=True)
     sums = np.bincount(visit, e - mean[bins])
     home = pair // (int(chunk.max(initial=0)) + 1)
@@ -156,7 +107,7 @@ def _curve(
 
 
 def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
-    """Return the residual of the holds over lg t, each hold with an offset of its own."""
+    """Return the residual of the holds over lg t; each hold has its own offset."""
     holds = [s for s in stretches if s.kind == 'rest' and s.step != 0.0]
     if len(holds) < 2:
         return []
@@ -170,7 +121,14 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
         used = np.flatnonzero(count)
         rows.append((used, sums[used] / count[used], s.step / largest))
     size = max(int(used[-1]) for used, _, _ in rows) + 1
-    curve = _common(rows, size)
+    # the curve g that fits e = offset of the hold + weight g(bin) best
+    A = np.zeros((sum(k.size for k, _, _ in rows), size + len(rows)))
+    at = 0
+    for i, (k, _, weight) in enumerate(rows):
+        A[np.arange(at, at + k.size), k] = weight
+        A[at : at + k.size, size + i] = 1.0
+        at += k.size
+    curve = np.linalg.lstsq(A, np.concatenate([e for _, e, _ in rows]), rcond=1e-9)[0][:size]
     x = first * 10.0 ** ((np.arange(size) + 0.5) / PER_DECADE)
     top, bottom, visits = np.zeros((3, size))
     for k, e, weight in rows:
@@ -184,17 +142,3 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     std = np.sqrt(top * visits / np.maximum(visits - 1, 1)) / np.maximum(bottom, 1e-300)
     mean = curve[shown] - curve[shown][0]
     return [Curve('time since the step', 'both', x[shown], mean, std[shown])]
-
-
-def _common(rows: Sequence[_Hold], size: int) -> Array:
-    """Return the curve g that fits e = offset of the hold + weight g(bin) best."""
-    n = sum(k.size for k, _, _ in rows)
-    A, b = np.zeros((n, size + len(rows))), np.zeros(n)
-    at = 0
-    for i, (k, e, weight) in enumerate(rows):
-        places = np.arange(at, at + k.size)
-        A[places, k] = weight
-        A[places, size + i] = 1.0
-        b[places] = e
-        at += k.size
-    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0][:size])

@@ -7,42 +7,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.model.metrics import percent
-from piezo_ident.record.readings.faults import end_of_rest, MOVED, quantum_of, STUCK, white_noise
+from piezo_ident.record.readings.faults import (
+    end_of_rest,
+    MAX_WILD,
+    MOVED,
+    quantum_of,
+    STUCK,
+    white_noise,
+    WINDOW,
+)
+from piezo_ident.record.readings.jumps import FAR
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-#: least size of a knock, share of the stroke; most times of knocks that are given
+#: least size of a knock, as a share of the stroke; most times of knocks in a message
 KNOCK, MOST_TIMES = 1e-4, 8
-#: a quantum is named above so many times the rest of the noise, and this share of the stroke
+#: least quantum of a fault, in multiples of the other noise and as a share of the stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
-#: deviations of an outlier, and the largest share of it that its surroundings may show
-FAR, QUIET = 8.0, 0.35
-#: where more of a part than this is outliers, they are the way of the data
-MOST_OUTLIERS = 0.1
-#: samples at the end of a clipped range, deviations by which the model leaves it meanwhile
+#: the surroundings of an outlier show at most this share of it
+QUIET = 0.35
+#: least samples at the end of a clipped range, deviations by which the model leaves it
 FLAT, LEFT = 5, 6.0
 #: jitter: deviations of the slope, least growth of the variance, blocks of samples
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
 #: third differences of white noise are anticorrelated by 3/4 from one sample to the next
 WHITE = (0.5, 1.0)
-#: jitter is read where the fast part of the motion has at most this share of the scatter's power
+#: jitter is read from motion whose fast part has at most this share of the scatter's power
 SMOOTH = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class FaultSearch:
-    """
-    Faults found.
-
-    `bad` are for each part the samples to leave out; `quantum` is the step of the readings [m], 0
-    when there is none.
-    """
+    """Faults, the samples to leave out of each part, and the step of the readings [m] or 0."""
 
     faults: tuple[Fault, ...]
     bad: tuple[Mask, ...]
@@ -71,7 +74,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             if jitter > 0.0 and outliers.any():
                 # most of them may be readings at the wrong moment
                 outliers = _outliers(part, noise, clipped, jitter)
-            many = float(outliers.mean()) > MOST_OUTLIERS
+            many = float(outliers.mean()) > MAX_WILD
             faults += _masked(part, outliers, clipped, many)
             faults += _of_all(part, stroke, noise, jitter, growth)
             faults += _knocks(part, stroke, noise, outliers | clipped)
@@ -82,20 +85,17 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
 
 def _masked(part: ResidualPart, outliers: Mask, clipped: Mask, many: bool) -> list[Fault]:
     action = 'left in, as they are the way of the data' if many else 'left out'
-    told = {
-        'outliers': (outliers, f'isolated jumps; {action}'),
-        'clipping': (clipped, 'at the end of their range while the model moves; left out'),
-    }
-    return [
-        Fault(
-            name,
-            f'in {part.record}, first at {part.piece.t[int(np.argmax(mask))]:.6g} s',
-            int(mask.sum()),
-            what,
-        )
-        for name, (mask, what) in told.items()
-        if mask.any()
-    ]
+    end = 'at the end of their range while the model moves; left out'
+    faults = []
+    for name, mask, what in (
+        ('outliers', outliers, f'isolated jumps; {action}'),
+        ('clipping', clipped, end),
+    ):
+        if mask.any():
+            first = float(part.piece.t[int(np.argmax(mask))])
+            where = f'in {part.record}, first at {first:.6g} s'
+            faults.append(Fault(name, where, int(mask.sum()), what))
+    return faults
 
 
 def _of_all(
@@ -132,8 +132,7 @@ def _knocks(part: ResidualPart, stroke: float, noise: _Noise, known: Mask) -> li
     return [Fault('outliers', f'in {part.record}, at {times}{more} s', len(found.times), what)]
 
 
-@dataclass(frozen=True)
-class _Noise:
+class _Noise(NamedTuple):
     """Fast noise of readings: rms, their step q (0 for none), rms without q / sqrt(12) [m]."""
 
     rms: float
@@ -143,8 +142,7 @@ class _Noise:
 
 def _noise_of(part: ResidualPart) -> _Noise:
     """Return the fast noise of a part's readings; a model's misfit is too slow to matter."""
-    y = part.piece.y
-    quantum = quantum_of(y)
+    quantum = quantum_of(part.piece.y)
     rms = white_noise(np.diff(part.e, 3)[part.mask[3:]], quantum)
     rest = float(np.sqrt(max(rms * rms - quantum * quantum / 12.0, 0.0)))
     return _Noise(rms, quantum, rest)
@@ -156,15 +154,18 @@ def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.
     height = np.zeros(e.size)
     height[1:-1] = e[1:-1] - 0.5 * (e[:-2] + e[2:])
     size = np.abs(height)
-    window = 101
-    # the usual scatter around a sample: of jittered or driven data it changes along the record
-    local = _running_median(size, window) * 1.4826
+    # the usual scatter around a sample changes along jittered or driven data: the largest median
+    # of a block and its neighbours
+    blocks = max(1, size.size // WINDOW)
+    medians = np.median(size[: blocks * WINDOW].reshape(blocks, -1), axis=1)
+    medians = maximum_filter1d(medians, 3, mode='nearest')
+    local = 1.4826 * medians[np.minimum(np.arange(size.size) // WINDOW, blocks - 1)]
     level = np.maximum(local, np.sqrt(1.5) * noise.rms)
     level = np.maximum(level, 1e-6 * float(np.ptp(part.piece.y)))
     if jitter > 0.0:
         slope = np.gradient(part.y_hat) * part.piece.sample_rate
         level = np.hypot(level, np.sqrt(1.5) * jitter * slope)
-    # a model whose G answers at once may jump where the drive turns: then the reading did not
+    # a model whose G answers at once may jump while the reading does not
     jumps = np.zeros(e.size)
     jumps[1:-1] = np.abs(part.y_hat[1:-1] - 0.5 * (part.y_hat[:-2] + part.y_hat[2:]))
     high = (size > FAR * level) & (size > 3.5 * noise.quantum) & (jumps < 0.5 * size)
@@ -179,14 +180,6 @@ def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.
         rest = around - np.polynomial.Polynomial.fit(places, around, 1)(places)
         found[k] = float(np.abs(rest).max()) < QUIET * size[k]
     return found
-
-
-def _running_median(x: Array, window: int) -> Array:
-    """Return the larger of the medians of a block and its neighbours, for every sample."""
-    blocks = max(1, x.size // window)
-    means = np.median(x[: blocks * window].reshape(blocks, -1), axis=1)
-    means = maximum_filter1d(means, 3, mode='nearest')
-    return np.asarray(means[np.minimum(np.arange(x.size) // window, blocks - 1)])
 
 
 def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
@@ -204,7 +197,7 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
             moved, drive = float(np.ptp(y_hat[a:late])), float(np.ptp(v[a:late]))
             gone = moved > LEFT * (noise.rms + noise.quantum) and moved > 1e-4 * stroke
             if drive > 1e-4 * span and (gone or (drive > MOVED * span and b - a >= STUCK)):
-                # what reads the same elsewhere has been cut off there too
+                # all readings of this value are clipped
                 found |= at
                 break
     return found & part.mask
@@ -212,12 +205,12 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
 
 def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, float]:
     """
-    Return the rms scatter of the sampling instants [s], and by how much the variance grows.
+    Return the rms scatter of the sampling instants [s], and the growth of the variance by it.
 
-    A reading taken late by delta is off by dy/dt delta, so the variance of the residual is
-    sigma^2 + jitter^2 (dy/dt)^2.  Third differences remove the error of the model where the motion
-    is smooth.  The rest of that error grows with the third differences of the motion: they are the
-    second cause in the regression, and blocks where they are large are not used.
+    A reading that is late by delta is off by dy/dt delta: the variance of the residual is
+    sigma^2 + jitter^2 (dy/dt)^2.  Third differences remove the error of the model in smooth
+    motion.  The rest of that error grows with the third differences of the motion.  They are the
+    second cause in the regression, and blocks with large ones are not used.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)

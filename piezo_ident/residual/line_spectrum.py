@@ -18,28 +18,28 @@ from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-#: the search goes to this share of half the rate after averaging, which is about this rate [Hz]
+#: top of a search as a share of half the averaged rate, and about that rate [Hz]
 TOP, RATE = 0.8, 2500.0
-#: shortest stretch that is looked at [s]
+#: shortest stretch of a search [s]
 SHORTEST = 0.3
-#: neighbours on either side that a line is held against, and fewest of them [bins]
+#: most and fewest neighbours on either side that a line is compared with [bins]
 NEIGHBOURS, FEWEST = 31, 7
-#: a bin belongs to the drive where it stands so far out of the bins around, rounding apart
+#: least power of a bin of the drive, in multiples of the bins around and of the largest bin
 LOCKED, ROUNDING = 16.0, 1e-12
-#: gain of differences, or of means, below which nothing is read
+#: least gain of differences, or of means, that shows a line
 FAINT = 0.15
-#: a median of exponential variables is worth this share of a mean as an estimate of their scale
+#: worth of a median of exponential variables, as a share of a mean, as an estimate of their scale
 MEDIAN_WORTH = 0.48
-#: points of the grid on either side that a spline of the transform stands on, too
+#: further points of the grid on either side under a spline of the transform
 WIDER = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
     """
-    A stretch of the residual at the lower rate, as differences where the drive repeats.
+    A stretch of the residual at the lower rate; differences if the drive repeats.
 
-    `driven` is power that the drive may have put there, `locked` are the bins of its periods.
+    `driven` is power that the drive may have caused, `locked` are the bins of its periods.
     """
 
     record: str
@@ -54,7 +54,7 @@ class Series:
     locked: Mask | None = None
 
     def gain(self, f: Array) -> NDArray[np.complex128]:
-        """Return what the block means, and the differences, make of a wave at f."""
+        """Return the gain of block means and differences for a wave at f."""
         x = np.pi * np.asarray(f) / self.rate
         mean = np.where(
             x > 0.0, np.sin(x) / np.maximum(self.block * np.sin(x / self.block), 1e-300), 1.0
@@ -65,9 +65,9 @@ class Series:
 
     def comb(self, f: Array) -> Array:
         """
-        Return what the differences make of the spectrum of white noise, relative to its mean.
+        Return the spectrum of differences of white noise, relative to its mean.
 
-        Averaging folds higher frequencies back, where the comb has its teeth elsewhere.
+        Averaging folds higher frequencies back, and the comb has its teeth elsewhere there.
         """
         lag = round(self.lag * self.rate)
         if not 0 < lag < self.x.size:
@@ -76,12 +76,10 @@ class Series:
         overlap = float(self.window[lag:] @ self.window[:-lag]) / power
         if self.block == 1:
             return np.asarray(1.0 - overlap * np.cos(2.0 * np.pi * f * self.lag))
-        folded = [f, self.rate - f, self.rate + f, 2.0 * self.rate - f]
-        weights = [np.sinc(g / self.rate) ** 2 for g in folded]
-        teeth = sum(
-            w * np.cos(2.0 * np.pi * g * self.lag) for w, g in zip(weights, folded, strict=True)
-        )
-        return np.asarray(1.0 - overlap * teeth / sum(weights))
+        folded = np.array([f, self.rate - f, self.rate + f, 2.0 * self.rate - f])
+        weights = np.sinc(folded / self.rate) ** 2
+        teeth = np.sum(weights * np.cos(2.0 * np.pi * folded * self.lag), axis=0)
+        return np.asarray(1.0 - overlap * teeth / weights.sum(axis=0))
 
 
 def series_of(
@@ -99,7 +97,7 @@ def series_of(
             continue
         start = s.start
         if s.kind == 'rest' and s.step:
-            # what still answers to the step is no line
+            # the answer to the step is no line
             start += min(s.n // 5, round(0.1 * rate))
         # on the ticks of the lower rate, so that stretches of a record differ by whole samples
         first = round(piece.start_time * rate) + start
@@ -136,7 +134,7 @@ def _series(part: ResidualPart, start: int, x: Array, m: int, period: int = 0) -
 def _motions(
     part: ResidualPart, used: Sequence[tuple[int, int]], m: int, shortest: float
 ) -> list[Series]:
-    """Return the stretches between those used, without what the drive explains."""
+    """Return the stretches between those used, less the best functions of the drive."""
     piece, free = part.piece, part.joined
     for start, stop in used:
         free[start:stop] = False
@@ -158,9 +156,9 @@ def _motions(
 
 def _locked(v: Array) -> Mask:
     """
-    Return the bins at which a drive that goes on in periods may leave a line, shape (n // 2 + 1,).
+    Return a mask of the bins at which a periodic drive may leave a line, shape (n // 2 + 1,).
 
-    Its turns, as impulses, have every harmonic, also those at which a mode rings.
+    Impulses at its turns have every harmonic, also harmonics at which a mode rings.
     """
     turns = turns_of(v, TURN * float(np.ptp(v)))
     signed, plain = np.zeros(v.size), np.zeros(v.size)
@@ -179,9 +177,9 @@ def _locked(v: Array) -> Mask:
 
 def _driven(v: Array, x: Array, window: Array) -> Array:
     """
-    Return the power that the drive may have put into a residual, were it all the drive's.
+    Return the largest power that the drive may have caused in a residual.
 
-    The residual is shared out like v, its square, its cube, and its direction, which has the
+    The residual gets the spectra of v, its square, its cube, and its direction, which has the
     harmonics of hysteresis.
     """
     u = v - v.mean()
@@ -197,10 +195,10 @@ def _driven(v: Array, x: Array, window: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class Spectrum:
     """
-    Windowed transform of a series on a grid of frequencies, seen from a time common to all.
+    Windowed transform of a series on a grid of frequencies, from a time that all series share.
 
-    `noise` is the mean square of the transform around each frequency without a line, and `worth`
-    the averages that it is worth; all have shape (p,).
+    `noise` is the mean square of the transform around each frequency without a line, `worth` the
+    number of averages in it; shapes (p,).
     """
 
     series: Series
@@ -221,9 +219,9 @@ class Spectrum:
 
     def between(self, f: Array, near: Integers) -> Callable[[Array], NDArray[np.complex128]]:
         """
-        Return the transform as a function of any frequency [Hz] among some of the grid f.
+        Return the transform as a function of any frequency [Hz] near some points of the grid f.
 
-        The transform is smooth when time counts from the middle of the stretch.  A spline of fifth
+        The transform is smooth if time counts from the middle of the stretch.  A spline of fifth
         degree errs by 1e-5 of the maximum for the longest stretch, and by far less for others.
         """
         s = self.series
@@ -238,11 +236,11 @@ class Spectrum:
 
 def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
     """
-    Return the mean square of the transform around each f without a line, and its worth.
+    Return the mean square of the transform around each f without a line, and its averages.
 
     The geometric mean of the medians on both sides leaves a power law as it is.  Differences over
     a lag make a comb of the noise, as deep as the window overlaps itself shifted by that lag.
-    Where the drive does not repeat, what it may have left at a frequency counts as noise.
+    Power of a drive that does not repeat counts as noise.
     """
     rate = s.rate
     power = np.abs(fft.rfft(s.window * s.x)) ** 2

@@ -4,9 +4,9 @@
 """
 Narrow lines in a residual that the drive did not make: hum, its harmonics, any other source.
 
-The best common sine of all stretches, each weighted by its own noise around the frequency
-(`line_spectrum`), is held against its neighbours, as Fisher (1929), Proc. R. Soc. A 125, 54-59,
-doi:10.1098/rspa.1929.0151, and corrected for the number of bins.
+The best common sine of all stretches is tested against its neighbours, as by Fisher (1929), Proc.
+R. Soc. A 125, 54-59, doi:10.1098/rspa.1929.0151.  Each stretch is weighted by its own noise around
+the frequency (`line_spectrum`).  The test is corrected for the number of bins.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array
 from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
 from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
 from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
 
-#: most lines that are looked for
+#: most lines of a search
 LINES = 6
 #: chance of one false line in a search
 SIGNIFICANT = 1e-3
-#: converters make lines below this share of the stroke; and lines below this share of the residual
-#: come from a motion that is nearly locked to the drive
+#: least line as a share of the stroke, as converters make smaller lines, and of the residual, as a
+#: motion that is nearly locked to the drive makes smaller lines
 SMALLEST, SIDELINE = 1e-5, 0.01
 #: points of the common grid in one bin of the whole search
 FINE = 2.5
-#: between two bins the largest score is found more often than at them; seen in white noise
+#: independent trials in one bin: the largest score is mostly between two bins (white noise)
 TRIALS = 4.0
-#: a line is the same everywhere: in each half of the data this share of its amplitude, at least
+#: least share of the amplitude of a line in each half of the data
 STEADY = 0.5
-#: share of the largest gain on the grid from which the line may be there
+#: least gain on the grid near a line, as a share of the largest gain
 LOBE = 0.4
-#: two no less than this share of each other, and as close by, are a resonance that rings
+#: two lines of similar size (this share) and frequency (this share) are a resonance that rings
 COMPARABLE, BESIDE = 0.5, 0.02
 #: harmonics that are grouped under their base
 HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
@@ -49,8 +49,8 @@ class Line:
     """
     One narrow line [Hz], and its largest amplitude over the records [m].
 
-    The harmonics come with their orders; `records` are (record, amplitude [m], phase [rad] of the
-    sine at time zero of the record).
+    The harmonics have their orders; `records` are (record, amplitude [m], phase [rad] of the sine
+    at time zero of the record).
     """
 
     frequency: float
@@ -61,7 +61,7 @@ class Line:
 
 @dataclass(frozen=True)
 class LineSearch:
-    """The lines found, by falling amplitude, and whether a stretch was long enough."""
+    """Lines by falling amplitude, and whether a stretch was long enough for a search."""
 
     lines: tuple[Line, ...] = ()
     searched: bool = False
@@ -71,12 +71,13 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     """
     Search residuals of one sampling rate for narrow lines that are not locked to the drive.
 
-    Where v repeats, the residuals of consecutive periods are subtracted.  The difference holds
-    nothing that the drive makes, and a line of any other frequency with a known gain.
+    Residuals of consecutive periods of a repeating v are subtracted.  The difference holds nothing
+    that the drive makes, and lines of other frequencies with a known gain.
     """
     series, rate, high = series_of(parts, stretches)
     if not series:
         return LineSearch()
+    strokes = strokes_of(parts)
     seconds = max(s.t + s.x.size / rate for s in series) - min(s.t for s in series)
     size = fft.next_fast_len(round(FINE * seconds * rate), real=True)
     longest = max(s.x.size for s in series) / rate
@@ -84,12 +85,14 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     keep = (f >= (FEWEST + 2) / longest) & (f <= high)
     searched = bool(keep.any())
     bins = max(1.0, TRIALS * float(keep.sum()) / FINE)
-    negligible = max(SMALLEST * max(strokes_of(parts).values()), SIDELINE * _rms(parts))
+    residuals = {name: [p.e[p.mask] for p in parts if p.record == name] for name in strokes}
+    rms = min(float(np.std(np.concatenate(e))) for e in residuals.values())
+    negligible = max(SMALLEST * max(strokes.values()), SIDELINE * rms)
     search = _Search(series, f, size)
     found: list[Line] = []
     score, gain = search.score()
     for _ in range(2 * LINES):
-        # strong lines are significant at their neighbours, too; the strongest is where it is
+        # strong lines are significant at their neighbours, too: the largest gain is the line
         significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
             break
@@ -101,21 +104,19 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
             found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
             score, gain = search.score()
-            crowd = _crowd(found)
-            if crowd:
+            # lines like the last one and close to it, the last one among them
+            crowd = [
+                line
+                for line in found
+                if abs(line.frequency - frequency) <= BESIDE * frequency
+                and COMPARABLE <= amplitude / line.amplitude <= 1.0 / COMPARABLE
+            ]
+            if len(crowd) > 1:
                 found = [line for line in found if line not in crowd]
                 keep &= np.abs(f - frequency) > BESIDE * frequency
         # the refined frequency may lie some bins away from the highest gain
         keep &= np.minimum(np.abs(f - frequency), np.abs(f - f[best])) > 2.0 / longest
     return LineSearch(_grouped(found, 2.0 / longest), searched)
-
-
-def _rms(parts: Sequence[ResidualPart]) -> float:
-    """Return the smallest rms of a residual among the records, each about its mean."""
-    records: dict[str, list[Array]] = {}
-    for part in parts:
-        records.setdefault(part.record, []).append(part.e[part.mask])
-    return min(float(np.std(np.concatenate(e))) for e in records.values())
 
 
 class _Search:
@@ -141,10 +142,10 @@ class _Search:
 
     def score(self) -> tuple[Array, Array]:
         """
-        Return for every f -ln of its chance under noise alone, and the gain.
+        Return -ln of the chance under noise alone for every f, and the gain.
 
         The gain is the sum of weighted squares that a sine explains, and has its maximum at the
-        frequency of the line.  The chance depends on how well the noise is known there, too.
+        frequency of the line.  The chance depends on the uncertainty of the noise there, too.
         """
         n = self._f.size
         total, gain = np.zeros(n), np.zeros(n)
@@ -163,8 +164,8 @@ class _Search:
                 doubt += own * own / s.worth
             safe = np.maximum(information, tiny)
             ratio = np.abs(top) ** 2 / safe
-            # F with 2 and 2k degrees of freedom, since the noise is itself an estimate: that of
-            # each stretch for itself, so their doubts average (Welch and Satterthwaite)
+            # F with 2 and 2k degrees of freedom, since the noise of each stretch is an estimate
+            # (Welch and Satterthwaite)
             k = np.maximum(safe**2 / np.maximum(doubt, tiny), 1.0)
             gain += ratio
             total += k * np.log1p(ratio / k)
@@ -172,13 +173,16 @@ class _Search:
 
     def refined(self, best: int) -> float:
         """
-        Return the frequency of the least squared error around one, all with the noise at that one.
+        Return the frequency of the least squared error around a grid point, with its noise.
 
-        A strong line counts as noise of the bins beside it, and the least of that is not its
-        frequency.  Stretches far apart agree at many frequencies nearly as well, which are closer
-        to each other than the grid is fine.
+        A strong line counts as noise of the bins beside it, and the minimum of that noise is not
+        the frequency of the line.  Stretches far apart agree nearly as well at many frequencies
+        between two points of the grid.
         """
-        near = self._near(best)
+        power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
+        series = self._spectra[int(np.argmax(power))].series
+        reach = round(3.0 * series.rate / series.x.size / float(self._f[1]))
+        near = np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
         transforms = [s.between(self._f, near) for s in self._spectra]
 
         def gain(f: Array) -> Array:
@@ -194,15 +198,8 @@ class _Search:
             centres = centres + np.clip(move, -width, width)
         return float(centres[np.argmax(gain(centres))])
 
-    def _near(self, best: int) -> Integers:
-        """Return the indices of the frequencies among which a line seen at one may be."""
-        power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
-        series = self._spectra[int(np.argmax(power))].series
-        reach = round(3.0 * series.rate / series.x.size / float(self._f[1]))
-        return np.arange(max(best - reach, 1), min(best + reach + 1, self._f.size))
-
     def _gains(self, f: Array, values: Sequence[NDArray[np.complex128]], best: int) -> Array:
-        """Return what a sine at f takes off the weighted squares, from the transforms there."""
+        """Return the weighted squares that a sine at f explains, by the transforms there."""
         gains = np.zeros(f.size)
         for name in self.records:
             top, information = np.zeros(f.size, np.complex128), np.zeros(f.size)
@@ -220,7 +217,7 @@ class _Search:
         return float(abs(a)), float(np.angle(1j * a))
 
     def is_steady(self, frequency: float, best: int) -> bool:
-        """Return whether both halves of the stretches see the same sine; a transient does not."""
+        """Return whether both halves of the stretches have the same sine, unlike a transient."""
         for name in self.records:
             whole, information = self._fit(frequency, name, best)
             if abs(whole) ** 2 * information < 12.0:
@@ -236,9 +233,9 @@ class _Search:
         self, frequency: float, record: str, k: int, half: int | None = None
     ) -> tuple[complex, float]:
         """
-        Return the best common amplitude of a record's stretches, and the information on it.
+        Return the best common amplitude of a record's stretches, and its information.
 
-        The noise is that at index k; stretches with a faint gain do not count.
+        The noise is taken at index k; stretches with a faint gain do not count.
         """
         top, bottom = 0j, 0.0
         for spectrum in self._spectra:
@@ -264,22 +261,10 @@ def _log_chance(total: Array, n: int) -> Array:
     if n == 1:
         return total
     p = gammaincc(n, total)
-    # far out the asymptotic form, which does not underflow
+    # the asymptotic form of a large total does not underflow
     with np.errstate(divide='ignore', invalid='ignore'):
         far = total - (n - 1) * np.log(np.maximum(total, 1.0)) + float(gammaln(n))
         return np.asarray(np.where(total > 500.0, far, -np.log(np.maximum(p, 1e-300))))
-
-
-def _crowd(found: Sequence[Line]) -> list[Line]:
-    """Return the last line and those like it close by, if there are any."""
-    last = found[-1]
-    near = [
-        line
-        for line in found
-        if abs(line.frequency - last.frequency) <= BESIDE * last.frequency
-        and COMPARABLE <= last.amplitude / line.amplitude <= 1.0 / COMPARABLE
-    ]
-    return near if len(near) > 1 else []
 
 
 def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:
@@ -299,17 +284,11 @@ def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:
 
 
 def without_lines(part: ResidualPart, lines: Sequence[Line]) -> ResidualPart:
-    """Return a part without the lines of its record, harmonics included as they were fitted."""
-    own = [
-        (line.frequency, amplitude, phase)
-        for base in lines
-        for line in (base, *(harmonic for _, harmonic in base.harmonics))
-        for name, amplitude, phase in line.records
-        if name == part.record
-    ]
-    if not own:
-        return part
-    e, t = part.e.copy(), part.piece.t
-    for frequency, amplitude, phase in own:
-        e -= amplitude * np.sin(2.0 * np.pi * frequency * t + phase)
-    return part.with_residual(e)
+    """Return a part without the lines of its record and their harmonics."""
+    e, t = part.e.copy(), part.piece.t if lines else np.zeros(0)
+    for base in lines:
+        for line in (base, *(harmonic for _, harmonic in base.harmonics)):
+            for name, amplitude, phase in line.records:
+                if name == part.record:
+                    e -= amplitude * np.sin(2.0 * np.pi * line.frequency * t + phase)
+    return part.with_residual(e) if lines else part

@@ -1,28 +1,29 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The noise floor of a residual: what comes out differently each time the drive is the same."""
+"""The noise floor of a residual: its part that differs from one equal drive to the next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.residual.stretches import ResidualPart, Stretch
 from scipy import signal
 
-#: a frame of differences is freed of a slow change of this order
+#: order of the slow change that is subtracted from a frame of differences
 ORDER = 3
 #: shortest frame [s]: slower changes count as drift
 FRAME = 0.25
-#: share at the start of a rest that is left out, and at least this time [s]
+#: share at the start of a rest that is left out, and least time of it [s]
 SETTLING, SETTLING_TIME = 0.2, 0.02
-#: a residual is white where its third differences tell this share of its rms at least, over so
-#: many samples (level of the test: the estimate then scatters by 2 %)
+#: least share of the rms of a white residual in its third differences, and fewest samples of it
+#: (level of the test: the estimate then scatters by 2 %)
 WHITE, FEWEST = 0.95, 2000
-#: most blocks a table of block lengths goes up to
+#: longest block of a table of block lengths [samples]
 LONGEST_BLOCK = 4096
 
 
@@ -31,18 +32,9 @@ class NoiseFloor:
     """
     Noise that no model of the voltage can explain.
 
-    Attributes
-    ----------
-    rms : float or None
-        Of single samples [m]; None when it is unknown.
-    source : str
-        Where it was read, in words.
-    blocks : ndarray of int, shape (k,)
-        Block lengths [samples], from 1.
-    block_rms : ndarray, shape (k,)
-        Rms of the noise after averaging over blocks [m].
-    frequency, density : ndarray, shape (p,)
-        Power spectral density of the noise [Hz], [m^2/Hz]; empty when unknown.
+    `rms` is that of single samples [m], None if it is unknown; `source` says how it was read.
+    `block_rms` is the rms of means [m] over `blocks` of 1, 2, 4, ... samples, shapes (k,).  The
+    power spectral `density` [m^2/Hz] over `frequency` [Hz], shapes (p,), may be empty.
     """
 
     rms: float | None
@@ -59,10 +51,10 @@ class NoiseFloor:
 
     def at(self, m: float) -> float | None:
         """
-        Return the rms of the noise in means over blocks of m samples [m], None when unknown.
+        Return the rms of the noise in means over blocks of m samples [m], None if unknown.
 
-        Between the block lengths measured it is interpolated as a power law; beyond the longest,
-        where no data tell, the mean slope of the last two octaves goes on.
+        A power law interpolates between the measured block lengths.  The mean slope of the last
+        two octaves goes on beyond the longest.
         """
         if self.rms is None:
             return None
@@ -81,7 +73,7 @@ class NoiseFloor:
         """
         Return the mean squares in a row of m samples and in one, normalised by a span [m].
 
-        That of one is None where the floor is unknown; `quantum` is the step of the readings [m].
+        The second is None if the floor is unknown; `quantum` is the step of the readings [m].
         """
 
         def square(rms: float, m: int) -> float:
@@ -92,11 +84,11 @@ class NoiseFloor:
         return square(self.at(m) or 0.0, m), single
 
 
-@dataclass(frozen=True, eq=False)
-class _Reading:
+class _Reading(NamedTuple):
+    """Noise of a stretch, its rate [Hz], and the variances of means over 1, 2, 4, .. samples."""
+
     series: Array
     sample_rate: float
-    #: of means over 1, 2, 4, ... samples
     variances: Array
 
 
@@ -108,16 +100,13 @@ def residual_noise_floor(
 
     The difference of two consecutive periods of a repeating v, from the second period on, has
     twice the variance of the noise.  The error of the model repeats and drops out; slow drift is
-    subtracted.  Rests are used only without repeats, freed of parabolas in time and in the
-    logarithm of time, which describe creep.  The weighted median over the stretches counts, so
-    that a stretch that is still settling does no harm.  Without repeats and rests, a residual that
-    is white throughout is noise: the error of a model has a memory.
+    subtracted.  Records without repeats use rests, less parabolas in time and in the logarithm of
+    time, which describe creep.  The weighted median over the stretches counts, so that a settling
+    stretch does no harm.  A residual without repeats and rests is noise if it is white throughout:
+    the error of a model has a memory.  Noise slower than a period or a rest counts as drift.
 
-    Notes
-    -----
     Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012),
-    section 2.5, doi:10.1002/9781118287422.  Noise slower than a period, or than a rest, looks
-    like drift and is not counted.
+    section 2.5, doi:10.1002/9781118287422.
     """
     for kind, read in (('repeat', _repeat), ('rest', _rest)):
         every = [read(parts[s.part], s) for s in stretches if s.kind == kind]
@@ -128,7 +117,7 @@ def residual_noise_floor(
 
 
 def _white(parts: Sequence[ResidualPart]) -> NoiseFloor:
-    """Return the floor of a residual that is white: its third differences tell all of it."""
+    """Return the floor of a white residual, whose third differences show all of its power."""
     own = [part.e[part.mask] - part.e[part.mask].mean() for part in parts if part.mask.any()]
     third = [
         np.diff(part.e, 3)[np.lib.stride_tricks.sliding_window_view(part.mask, 4).all(axis=1)]
@@ -137,7 +126,7 @@ def _white(parts: Sequence[ResidualPart]) -> NoiseFloor:
     ]
     n = sum(x.size for x in third)
     if n >= FEWEST:
-        # of white noise the third difference has 20 times the variance
+        # the third difference of white noise has 20 times the variance
         fast = float(np.sqrt(sum(float(x @ x) for x in third) / (20.0 * n)))
         whole = float(np.sqrt(sum(float(x @ x) for x in own) / sum(x.size for x in own)))
         if WHITE * whole <= fast <= whole / WHITE:
@@ -149,8 +138,10 @@ def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
     p, rate = s.period, part.piece.sample_rate
     difference = part.e[s.start + 2 * p : s.stop] - part.e[s.start + p : s.stop - p]
     frame = min(max(p, round(FRAME * rate)), difference.size)
-    series = _detrended(difference, frame, _polynomial(frame)) / np.sqrt(2.0)
-    # means over more than half a period would see the end of one against the start of the next
+    order = ORDER if frame > 16 * ORDER else 0
+    basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, frame), order)
+    series = _detrended(difference, frame, basis) / np.sqrt(2.0)
+    # longer means would compare the end of one period with the start of the next
     return _reading(part, series, frame, min(p // 2, frame // 16), ORDER + 1)
 
 
@@ -168,15 +159,8 @@ def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
     return _reading(part, series, n, n // 16, basis.shape[1])
 
 
-def _polynomial(n: int) -> Array:
-    order = ORDER if n > 16 * ORDER else 0
-    return np.asarray(
-        np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), order), dtype=np.float64
-    )
-
-
 def _detrended(x: Array, frame: int, basis: Array) -> Array:
-    """Return x without what the basis explains of each frame, cut to whole frames."""
+    """Return the whole frames of x without their projections on a basis."""
     rows = x[: x.size // frame * frame].reshape(-1, frame)
     q, _ = np.linalg.qr(basis)
     return np.asarray((rows - (rows @ q) @ q.T).ravel())
@@ -193,44 +177,28 @@ def _reading(
     for m in 2 ** np.arange(top + 1):
         count = frame // m
         means = rows[:, : count * m].reshape(rows.shape[0], count, m).mean(axis=2)
-        # of several frames the median: drift may have bent one of them
+        # the median of several frames: drift may have bent one of them
         power = np.sum(means**2, axis=1) / max(count - removed, 1)
         variances.append(float(np.median(power) if power.size > 2 else power.mean()))
     return _Reading(series, part.piece.sample_rate, np.array(variances))
 
 
 def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:
+    """Return the floor by the median of readings, weighted by their samples."""
     longest = max(r.variances.size for r in readings)
-    variances = np.array(
-        [
-            _median([(r.variances[i], r.series.size) for r in readings if r.variances.size > i])
-            for i in range(longest)
-        ]
-    )
+    medians = []
+    for i in range(longest):
+        known = sorted((r.variances[i], r.series.size) for r in readings if r.variances.size > i)
+        behind = np.cumsum([size for _, size in known])
+        medians.append(known[int(np.searchsorted(behind, 0.5 * behind[-1]))][0])
     # averaging never adds noise
-    variances = np.minimum.accumulate(variances)
+    block_rms = np.sqrt(np.minimum.accumulate(medians))
     widest = max(readings, key=lambda r: r.series.size)
-    frequency, density = signal.welch(
-        widest.series, widest.sample_rate, nperseg=min(4096, max(16, widest.series.size // 8))
-    )
+    segment = min(4096, max(16, widest.series.size // 8))
+    frequency, density = signal.welch(widest.series, widest.sample_rate, nperseg=segment)
     seconds = sum(r.series.size / r.sample_rate for r in readings)
-    how = {
-        'repeat': 'differences of repeated periods',
-        'rest': 'rests of the voltage without creep',
-    }[kind]
-    return NoiseFloor(
-        rms=float(np.sqrt(variances[0])),
-        source=f'{how}, {len(readings)} stretches, {seconds:.3g} s',
-        blocks=2 ** np.arange(longest),
-        block_rms=np.sqrt(variances),
-        frequency=frequency,
-        density=density,
-    )
-
-
-def _median(weighted: Sequence[tuple[float, int]]) -> float:
-    values = np.array([x for x, _ in weighted])
-    weights = np.array([float(n) for _, n in weighted])
-    order = np.argsort(values)
-    behind = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(behind, 0.5 * behind[-1])])
+    way = 'differences of repeated periods'
+    way = way if kind == 'repeat' else 'rests of the voltage without creep'
+    source = f'{way}, {len(readings)} stretches, {seconds:.3g} s'
+    rms, blocks = float(block_rms[0]), 2 ** np.arange(longest)
+    return NoiseFloor(rms, source, blocks, block_rms, frequency, density)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How large a residual is over the way since the voltage last turned."""
+"""The size of a residual over the way since the last turn of the voltage."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from piezo_ident.residual.stretches import block_means
 
 #: edges of the stretches behind a turn, shares of the voltage range
 EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.01)
-#: a change of direction counts from this share of the range: noise turns all the time
+#: least turn, as a share of the range: noise turns all the time
 TURN = 0.01
-#: residuals are means over this time, so that noise does not hide what is looked for [s]
+#: residuals are means over this time against noise [s]
 MEAN = 0.002
 #: fewest means of a way
 FEWEST = 20
@@ -25,11 +25,7 @@ FEWEST = 20
 
 @dataclass(frozen=True)
 class Way:
-    """
-    Rms of each residual on a stretch of the way behind a turn, from n means over 2 ms.
-
-    The way is a share of the voltage range.
-    """
+    """Rms of each residual over a part of the way behind a turn, a share of the voltage range."""
 
     start: float
     stop: float
@@ -63,21 +59,11 @@ def turns_of(v: Array, least: float) -> Integers:
     return np.array(found, dtype=np.int64)
 
 
-def _way_since_turn(v: Array, span: float) -> Array:
-    """Return how far v has come since it last turned, share of its span; NaN before a turn."""
-    turns = turns_of(v, TURN * span)
-    way = np.full(v.size, np.nan)
-    if turns.size:
-        last = np.searchsorted(turns, np.arange(v.size), side='right') - 1
-        way = np.where(last >= 0, np.abs(v - v[turns[np.maximum(last, 0)]]) / span, np.nan)
-    return way
-
-
 def ways(
     pieces: Sequence[tuple[Array, Mask, float]], residuals: Sequence[Sequence[Array]]
 ) -> tuple[Way, ...]:
     """
-    Return the rms of residuals by the way since the last turn; nothing where none is found.
+    Return the rms of residuals by the way since the last turn; nothing without a turn.
 
     Each piece is (voltage [V], samples that count, rate [Hz]), and has one or more residuals.
     """
@@ -88,7 +74,11 @@ def ways(
     for (v, sound, rate), errors in zip(pieces, residuals, strict=True):
         m = max(1, round(MEAN * rate))
         keep = sound[: v.size // m * m].reshape(-1, m).all(axis=1)
-        way = _way_since_turn(block_means(v, m), span)
+        means = block_means(v, m)
+        turns = turns_of(means, TURN * span)
+        way = np.full(means.size, np.nan)
+        for a, b in itertools.pairwise([*turns.tolist(), means.size]):
+            way[a:b] = np.abs(means[a:b] - means[a]) / span
         found.append(np.stack([way, *(block_means(e, m) for e in errors)])[:, keep])
     table = np.concatenate(found, axis=1)
     rows = []

@@ -17,19 +17,19 @@ from piezo_ident.record.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-#: shortest rest: a voltage that stays for less belongs to the motion around it [s], [samples]
+#: shortest rest [s], [samples]: a shorter one belongs to the motion around it
 REST_TIME, REST_SAMPLES = 0.05, 200
-#: share of the differences of a measured voltage that reverse the one before while it rests
+#: least share of the differences of a measured voltage at rest that reverse the difference before
 TREMBLE = 0.3
-#: v repeats where it comes back within this share of its range
+#: a voltage that repeats comes back within this share of its range
 COMES_BACK = 2e-3
-#: so close is as good as exactly: of two such periods the shorter is taken
+#: closer repeats count as exact, and the shorter period is taken
 EXACT = 1e-4
-#: periods that must lie behind the first, which may still be settling
+#: least periods behind the first, which may still be settling
 PERIODS = 2
 #: share of a period that may be missing: a rest may have taken a sample of it
 SLACK = 0.02
-#: candidates for the period that are looked at in every octave
+#: tried candidates for the period in every octave
 CANDIDATES = 3
 #: longest stretch whose autocorrelation is computed [samples]
 LONGEST = 2**20
@@ -38,22 +38,12 @@ LONGEST = 2**20
 @dataclass(frozen=True, eq=False)
 class ResidualPart:
     """
-    What a model leaves of one piece of a record.
+    Residual of one piece of a record.
 
-    Attributes
-    ----------
-    record : str
-    piece : Piece
-    e : ndarray, shape (n,)
-        Measured minus simulated displacement, free run [m].  Over a few samples in a row that are
-        not sound it becomes a straight line.
-    sound : ndarray of bool, shape (n,), optional
-        False where samples were bridged or lost, or the memory of the start still matters.
-
-    Raises
-    ------
-    DataError
-        When the lengths differ, or a sound residual is not finite.
+    `e` is measured minus simulated displacement, free run [m], shape (n,).  `sound` is False for
+    bridged and lost samples, and while the memory of the start matters.  `e` is a straight line
+    over a few samples in a row that are not sound.  DataError if the lengths differ, or a sound
+    residual is not finite.
     """
 
     record: str
@@ -80,7 +70,7 @@ class ResidualPart:
 
     @property
     def mask(self) -> Mask:
-        """The samples that count, shape (n,)."""
+        """True for samples that count, shape (n,)."""
         return np.ones(self.piece.n, bool) if self.sound is None else self.sound
 
     @property
@@ -94,21 +84,20 @@ class ResidualPart:
 
     @property
     def joined(self) -> Mask:
-        """The samples that count, and the few in a row between them that do not."""
+        """True for samples that count, and for a few samples in a row between them."""
         return closed(self.mask, FEW)
 
     def runs(self) -> list[tuple[int, int]]:
-        """Return the stretches of `joined` samples, as first and behind the last."""
+        """Return start and stop of the runs of `joined` samples."""
         return true_runs(self.joined)
 
 
 @dataclass(frozen=True)
 class Stretch:
     """
-    A sound stretch of one part in which the voltage does one thing.
+    A 'rest', 'repeat' or 'motion' of one part, from sample `start` to before `stop`.
 
-    It is a 'rest', a 'repeat' or a 'motion' from sample `start` to before `stop`.  A repeat has a
-    `period` in samples, a rest the `step` of v [V] that led into it.
+    A repeat has a `period` in samples, a rest the `step` of v [V] that led into it.
     """
 
     part: int
@@ -137,16 +126,12 @@ def block_means(x: Array, m: int) -> Array:
 
 
 def all_stretches(parts: Sequence[ResidualPart]) -> list[Stretch]:
-    """Return the stretches of all parts, numbered as the parts are."""
+    """Return the stretches of all parts with the numbers of their parts."""
     return [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
 
 
 def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
-    """
-    Cut a part where its voltage comes to rest, starts to repeat, or changes its segment.
-
-    Stretches come in order of time; `number` is `Stretch.part`.
-    """
+    """Cut part `number` at rests, repeats and segments of its voltage, in order of time."""
     piece = part.piece
     v = piece.v
     shortest = _shortest(piece.sample_rate)
@@ -158,7 +143,7 @@ def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
             edge = start
             for a, b in still:
                 a, b = max(a, start), min(b, stop)
-                # the last sample before the first that repeats it is at the new level already
+                # a rest begins one sample before the first repeated sample
                 a -= a > start
                 if b - a < shortest:
                     continue
@@ -176,9 +161,9 @@ def _shortest(rate: float) -> int:
 
 def rests(v: Array, rate: float) -> list[tuple[int, int]]:
     """
-    Return where a voltage rests, as the first sample that repeats the one before, and the end.
+    Return the first repeated sample and the end of each rest of a voltage.
 
-    It rests where it is constant, or but for the noise of a measured voltage; `rate` in Hz.
+    A voltage at rest is constant but for the noise of its measurement; `rate` is in Hz.
 
     >>> rests(np.array([0.0, 1.0, 1.0, 1.0, 2.0]), 1000.0)
     [(2, 4)]
@@ -198,7 +183,7 @@ def rests(v: Array, rate: float) -> list[tuple[int, int]]:
 
 
 def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list[Stretch]:
-    """Return the repeating stretches of a motion, and what lies between them."""
+    """Return the repeating stretches of a motion, and the stretches between them."""
     if stop - start < shortest:
         return []
     found, edge = [], start
@@ -214,17 +199,13 @@ def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list
 
 def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
     """
-    Return where a signal repeats itself: (first sample, behind the last, period), in order.
+    Return the repeats of a signal in order: (start, stop, period) [samples].
 
-    A candidate is a minimum of the mean square difference between the signal and the same signal
-    shifted, behind the first maximum of that difference.  Each candidate is then compared sample
+    A candidate is a minimum of the mean square difference between the signal and the shifted
+    signal, behind the first maximum of that difference: de Cheveigne and Kawahara (2002), J.
+    Acoust. Soc. Am. 111, 1917-1930, doi:10.1121/1.1458024.  Each candidate is then compared sample
     by sample, so that other motion before and after does no harm.  A repeat has three periods at
     least.  Motions of several periods hide each other: without a repeat, both halves are searched.
-
-    Notes
-    -----
-    The difference function of de Cheveigne and Kawahara (2002), J. Acoust. Soc. Am. 111,
-    1917-1930, doi:10.1121/1.1458024.
     """
     span = float(np.ptp(v))
     if v.size < 3 * 8 or span == 0.0:
@@ -242,15 +223,14 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
         if matching:
             miss = max(float(np.sqrt(np.mean(difference[a:b] ** 2))) for a, b in matching)
             tried.append((miss / span, period, matching))
-    # the best first; among those that repeat about as well, the shortest
+    # the best repeat first; the shortest of about equal ones
     least = max(EXACT, 1.5 * min((miss for miss, _, _ in tried), default=0.0))
     tried.sort(key=lambda one: (max(one[0], least), one[1]))
     taken = np.zeros(v.size, dtype=bool)
     found = []
     for _, period, matching in tried:
         for a, b in matching:
-            free = true_runs(~taken[a : b + period])
-            for i, j in free:
+            for i, j in true_runs(~taken[a : b + period]):
                 if j - i >= (PERIODS + 1 - SLACK) * period:
                     found.append((a + i, a + j, period))
                     taken[a + i : a + j] = True
@@ -264,7 +244,7 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
 
 def _candidates(v: Array) -> list[int]:
     n, x = v.size, v - v.mean()
-    # two more, so that a period which just fits is a minimum inside
+    # two more, so that the longest period is an inner minimum
     longest = n // (PERIODS + 1) + 2
     size = fft.next_fast_len(n + longest + 1, real=True)
     spectrum = fft.rfft(x, size)
@@ -279,8 +259,8 @@ def _candidates(v: Array) -> list[int]:
     behind = int(np.argmax(d > 0.2 * top))
     minima = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] < d[2:])) + 1
     minima = minima[(minima > behind) & (d[minima] < 0.8 * top)]
-    # a short period that is not a whole number of samples repeats exactly at its multiples, and a
-    # signal may have both periods in turn: so the best of every octave
+    # a short period of no whole number of samples repeats exactly at its multiples, and a signal
+    # may have both periods in turn: the best of every octave are tried
     octave = np.floor(np.log2(np.maximum(minima, 1)))
     chosen: set[int] = set()
     for k in np.unique(octave):

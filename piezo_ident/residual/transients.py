@@ -1,11 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Knocks: short transients that come at random times, whatever the drive does."""
+"""Knocks: short transients at random times, independent of the drive."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array, interpolated, Mask
@@ -14,24 +14,23 @@ from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch, s
 from scipy import stats
 from scipy.ndimage import median_filter, uniform_filter1d
 
-#: time over which power is averaged, and over which what is slow is taken away [s]
+#: time over which power is averaged, and time of the mean that is subtracted [s]
 SHORT, SLOW = 0.004, 0.04
-#: power that a knock has at least, as a multiple of the usual
+#: least power of a knock, as a multiple of the usual power
 STANDS_OUT = 16.0
 #: longest knock, and distance at which two are one [s]
 LONGEST, TOGETHER = 0.25, 0.03
-#: a jump is alike on both sides once what is slow is gone; before a knock there is less
+#: power before a knock, as a share of the power behind it; a jump has equal power on both sides
 BEFORE = 0.6
 #: fewest knocks, and chance below which they belong to the turns of the drive
 FEWEST, CHANCE = 5, 0.02
-#: shortest way between two turns on which a place can be told [blocks]
+#: shortest way between two turns that shows the place of a knock [blocks]
 WAY = 8
-#: share at the start of a rest that is left out, and at least this time [s]
+#: share at the start of a rest that is left out, and least time of it [s]
 SETTLING, SETTLING_TIME = 0.2, 0.1
 
 
-@dataclass(frozen=True)
-class Transients:
+class Transients(NamedTuple):
     """Times [s] of knocks in a part, their largest size and usual length [m], [s]."""
 
     times: tuple[float, ...] = ()
@@ -43,15 +42,13 @@ def transients_in(part: ResidualPart, known: Mask, least: float) -> Transients:
     """
     Return the knocks in rests and in motion that repeats.
 
-    The median over the periods is subtracted from a motion that repeats: whatever a model lacks
-    repeats too.  A knock stands out of the usual power of the rest, begins suddenly, is short, and
-    comes anywhere between two turns of the drive.  Samples `known` to be faulty do not count.  A
-    knock is larger than `least` [m].
+    The median over the periods is subtracted from a motion that repeats: the error of a model
+    repeats, too.  A knock stands out of the usual power, begins suddenly, is short, is larger than
+    `least` [m], and comes anywhere between two turns of the drive.  Samples `known` to be faulty
+    do not count.
     """
-    found: list[tuple[float, float, float]] = []
     e = interpolated(part.e, known, part.mask)
-    for s in stretches_of(part):
-        found += _in_stretch(part, e, s, least)
+    found = [knock for s in stretches_of(part) for knock in _in_stretch(part, e, s, least)]
     if len(found) < FEWEST:
         return Transients()
     times, sizes, lengths = zip(*sorted(found), strict=True)
@@ -94,11 +91,11 @@ def _follows_turns(v: Array, events: list[tuple[int, float, float]], m: int) -> 
         return False
     last = np.searchsorted(turns, inside, side='right') - 1
     way = turns[last + 1] - turns[last]
-    # where it turns all the time no place can be told
+    # short ways do not show the place
     share = ((inside - turns[last]) / way)[way > WAY * m]
     if share.size < 2:
         return False
-    # begun late on one way and ended early on the next is the same place
+    # the end of one way and the beginning of the next are one place
     apart = [float(stats.kstest((share + x) % 1.0, 'uniform').pvalue) for x in (0.0, 0.5)]
     return min(apart) < CHANCE
 
@@ -106,7 +103,7 @@ def _follows_turns(v: Array, events: list[tuple[int, float, float]], m: int) -> 
 def _events(
     x: Array, power: Array, m: int, rate: float, least: float
 ) -> list[tuple[int, float, float]]:
-    """Return first sample, size and length of what stands out; power is of every m-th sample."""
+    """Return first sample, size and length of knocks; `power` is of every m-th sample."""
     step = m / rate
     usual = median_filter(power, size=2 * round(0.5 / step) + 1, mode='nearest')
     loud = np.flatnonzero(power > STANDS_OUT * np.maximum(usual, 1e-300))

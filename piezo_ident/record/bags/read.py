@@ -4,10 +4,9 @@
 """
 Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
 
-Topics are found by the quantity that their blocks carry, so remapped names are no obstacle, and a
-bag of several stages is told apart by their namespaces.  The blocks become a record in the way of
-a live capture, so that both are the same.  A bag whose recorder was killed is refused, or read as
-far as it goes when that is asked for.
+Topics are found by the quantity of their blocks, so remapped names are no obstacle; namespaces
+tell the stages of a bag apart.  A bag and a live capture of the same blocks become the same
+record.  The bag of a killed recorder is refused, or read as far as it goes if that is asked for.
 """
 
 from __future__ import annotations
@@ -59,18 +58,15 @@ def opened_bag(path: str | Path, *, in_file_order: bool = False) -> Iterator[Bag
     """
     Open a rosbag2 folder, or a single .mcap or .db3 file, as far as it was finished.
 
-    The file may be compressed as a whole, or message by message.  With `in_file_order` the
-    messages come as they were written, also where their log times are indexed.  DataError when
-    it is no bag, or damaged beyond what a killed recorder leaves; its messages raise it too, for
-    damage that shows itself later.
+    The file may be compressed as a whole, or message by message.  `in_file_order` gives the
+    messages as they were written, not by their log times.  DataError for no bag, and for more
+    damage than a killed recorder leaves; the iteration over its messages raises it too.
     """
     path = Path(path)
     try:
-        is_there = path.exists()
+        path.stat()
     except OSError as error:
         raise DataError(f'{path}: cannot be read ({error.strerror or error})') from None
-    if not is_there:
-        raise DataError(f'{path}: does not exist; check the name')
     if path.is_file() and not path.name.endswith((storage_of(path), '.zstd', '.zst')):
         raise DataError(f'{path}: a bag is known by .mcap or .db3 in small letters; rename it')
     if storage_of(path) == '.db3' and any(c in str(path) for c in '?#%'):
@@ -92,14 +88,14 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
     empty = reader.message_count == 0
     start = 0 if empty else reader.start_time
     end = 0 if empty else reader.end_time - 1
-    # rosbags takes over from metadata.yaml whatever is there
+    # rosbags takes over the contents of metadata.yaml unchecked
     texts = [text for c in reader.connections for text in (c.topic, c.msgtype)]
     numbers = [start, end, *(c.msgcount for c in reader.connections)]
     if not all(isinstance(x, str) for x in texts) or {type(x) for x in numbers} != {int}:
         raise DataError(f'{path}: damaged or unfinished bag (metadata of wrong types); mend it')
 
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
-        if connections:  # rosbags takes none for all
+        if connections:  # rosbags takes no connection for all connections
             with damage_as_data_error(path):
                 stored = itertools.starmap(Stored, reader.messages([*connections]))
                 yield from unpacked(stored, path)
@@ -108,7 +104,7 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
 
 
 def _has_index(reader: Reader) -> bool:
-    """Return whether every message of an mcap file is indexed: rosbags passes over the others."""
+    """Return whether every message of an mcap file is indexed: rosbags skips the others."""
     storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
     for storage in storages:
         chunks = getattr(storage, 'chunks', None)
@@ -123,13 +119,10 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
     """
     Read a rosbag2 folder, or a single .mcap or .db3 file; `choices` replace fields of the options.
 
-    Blocks come in the order of their log times, or in the order of the file where the clock of
-    the log was set back.
-
-    Where the bag holds ``applied_voltage`` beside the voltage, samples that the amplifier's guard
-    altered are cut out, as in a live capture.  DataError for a damaged bag, for blocks whose
-    layout does not fit, when no topic or more than one carries the voltage or the displacement,
-    and for all that `assemble` refuses.
+    Blocks come in the order of their log times, or of the file if the log clock was set back.  If
+    the bag holds ``applied_voltage``, samples that the amplifier's guard altered are cut out, as
+    in a live capture.  DataError for a damaged bag, a wrong layout of blocks, a voltage or
+    displacement on no topic or on several, and for columns that `assemble` refuses.
     """
     path = Path(path)
     options = replace(options or ReadOptions(), **choices)
@@ -159,11 +152,11 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
 @contextmanager
 def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Iterator[tuple[Bag, T]]:
     """
-    Open a bag whose messages come in the order in which its samples go on.
+    Open a bag whose messages come in the order of its samples.
 
-    That is the order of the log times, or, where the clock of these was set back, that of the
-    file.  `look` returns how many blocks go back in a bag, see `steps_back`, and what else it
-    found, which is that of the bag that is taken.
+    The messages come by their log times, or in the order of the file if the log clock was set
+    back.  `look` returns the number of blocks that go back, see `steps_back`, and a value, which
+    is passed on for the order that is taken.
     """
     with ExitStack() as stack:
         bag = stack.enter_context(opened_bag(path))
@@ -179,7 +172,7 @@ def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Itera
 
 class LogClock:
     """
-    Log times that rise on every topic: later by what their clock was set back.
+    Log times that rise on every topic: later by each step back of their clock.
 
     >>> clock = LogClock()
     >>> [clock.rising('v', stamp) for stamp in (5, 6, 3, 4)], clock.steps
@@ -202,7 +195,7 @@ class LogClock:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Whether the clock was set back."""
+        """A fault if the clock was set back."""
         where = f'by {max(self.steps, default=0) / 1e9:.3g} s from one block to the next'
         action = 'blocks taken in the order of the file'
         fault = Fault('log_time_step', where, len(self.steps), action)
@@ -210,16 +203,7 @@ class LogClock:
 
 
 class _Blocks:
-    """
-    The blocks of some topics of a bag, by quantity.
-
-    Attributes
-    ----------
-    streams : dict of str to BlockStream
-    back : int
-        How many blocks begin before the end of the one before.
-    clock : LogClock
-    """
+    """The streams of some topics of a bag by quantity, and the steps `back` of their blocks."""
 
     def __init__(self, bag: Bag, topics: Mapping[str, str]) -> None:
         self.streams = {quantity: BlockStream(spooled=True) for quantity in topics}
@@ -234,7 +218,7 @@ class _Blocks:
 
 
 def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
-    """Return how many blocks begin before the end of the one before of the same quantity."""
+    """Return the number of blocks that begin before the end of the block before."""
     ends: dict[str, float] = {}
     back = 0
     for quantity, samples in blocks:
@@ -245,14 +229,14 @@ def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
 
 
 def _sample_rate(path: Path) -> float | None:
-    """Return the sampling rate [Hz] in a bag's custom data, None without a sensible one."""
+    """Return the sampling rate [Hz] in a bag's custom data, None without a positive one."""
     try:
         info = metadata(path if path.is_dir() else path.parent)
         if path.is_file() and path.name not in info['relative_file_paths']:
             return None
         rate = float(info['custom_data']['sample_rate'])
     except (ConfigError, ValueError, TypeError, KeyError, OverflowError):
-        return None  # the stamps tell it as well
+        return None  # the stamps tell the rate as well
     return rate if 0 < rate < float('inf') else None
 
 
@@ -266,7 +250,7 @@ def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, in
 
 
 def carried_quantities(bag: Bag) -> dict[str, str]:
-    """Return what each topic carries, by its first message; DataError when none has samples."""
+    """Return the quantity of each topic, by its first message; DataError without samples."""
     carried = {}
     for connection in bag.connections:
         if connection.msgtype != MESSAGE_TYPE or connection.topic in carried:
@@ -289,20 +273,15 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
 
 
 def is_computed(topic: str) -> bool:
-    """Return whether a topic is computed by a model, and not measured."""
+    """Return whether a model computes a topic."""
     return topic.rpartition('/')[2] in ('prediction', 'residual', 'estimate')
 
 
 def _choose(
     carried: Mapping[str, str], asked: Mapping[str, str | None], namespace: str | None, path: Path
 ) -> dict[str, str]:
-    """Return the topic of each quantity, and of the applied voltage where it is there."""
-    chosen = {
-        quantity: _measured_topic(carried, quantity, namespace, path)
-        if topic is None
-        else _asked_topic(carried, quantity, f'/{topic.lstrip("/")}', path)
-        for quantity, topic in asked.items()
-    }
+    """Return the topic of each quantity, the applied voltage among them if it is there."""
+    chosen = {q: _topic_of(carried, q, topic, namespace, path) for q, topic in asked.items()}
     home = chosen['voltage'].rpartition('/')[0] + '/'
     applied = f'{home}{APPLIED}'
     if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
@@ -321,25 +300,18 @@ def _choose(
     return chosen
 
 
-def _asked_topic(carried: Mapping[str, str], quantity: str, topic: str, path: Path) -> str:
-    if topic not in carried:
-        raise DataError(
-            f'{path}: no samples on topic {topic}; topics with samples: '
-            + ', '.join(sorted(carried))
-        )
-    if carried[topic] != quantity:
-        fit = sorted(t for t, q in carried.items() if q == quantity)
-        raise DataError(
-            f'{path}: {topic} carries {carried[topic]}, not {quantity}; topics with '
-            f'{quantity}: {", ".join(fit) or "none"}'
-        )
-    return topic
-
-
-def _measured_topic(
-    carried: Mapping[str, str], quantity: str, namespace: str | None, path: Path
+def _topic_of(
+    carried: Mapping[str, str], quantity: str, asked: str | None, namespace: str | None, path: Path
 ) -> str:
-    """Return the one topic with a measured quantity below a namespace."""
+    """Return the topic that is asked for, or the one measured topic below a namespace."""
+    topics = ', '.join(f'{topic} ({carried[topic]})' for topic in sorted(carried))
+    if asked is not None:
+        topic = f'/{asked.lstrip("/")}'
+        if carried.get(topic) != quantity:
+            has = f'{topic} carries {carried[topic]}, not {quantity}'
+            fault = has if topic in carried else f'no samples on topic {topic}'
+            raise DataError(f'{path}: {fault}; topics with samples: {topics}')
+        return topic
     prefix = '/' if namespace is None else f'/{namespace.strip("/")}/'.replace('//', '/')
     there = [t for t, q in carried.items() if q == quantity and t.startswith(prefix)]
     # a model fitted to the prediction of another would look perfect
@@ -356,8 +328,7 @@ def _measured_topic(
     if not fit:
         below = '' if namespace is None else f' below {prefix}'
         raise DataError(
-            f"{path}: no topic carries 't,{quantity}'{below}; topics with samples: "
-            + ', '.join(sorted(carried))
+            f"{path}: no topic carries 't,{quantity}'{below}; topics with samples: {topics}"
         )
     if len(fit) > 1:
         raise DataError(

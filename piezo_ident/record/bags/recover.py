@@ -6,8 +6,8 @@ Bags without an index, read from the beginning of their files, message by messag
 
 An unfinished bag lacks metadata.yaml or the end of an mcap file, or the journal of a transaction
 lies beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all committed
-rows of a database.  The bag stays as it is: journals are applied to copies, and compressed files
-are unpacked to copies.
+rows of a database.  The bag stays as it is: recovery applies journals to copies, and unpacks
+compressed files into copies.
 """
 
 from __future__ import annotations
@@ -43,9 +43,7 @@ _SIDECARS = ('-journal', '-wal')
 _BAG_FILE = re.compile(r'(?P<name>.+(?P<storage>\.mcap|\.db3))(\.zstd?)?', re.IGNORECASE)
 #: first bytes of zstd data; a message itself begins with a zero
 _ZSTD = b'\x28\xb5\x2f\xfd'
-#: bytes that are unpacked together
-_UNPACKED = 1 << 22
-#: a recorder compresses so many messages at once, at most, and writes each when it is done
+#: most messages that a recorder compresses at once; it writes each when it is ready
 _AT_ONCE = 64
 _FORMATS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
 
@@ -64,21 +62,11 @@ Messages = Callable[[Collection[Connection]], Iterator[Stored]]
 @dataclass(frozen=True)
 class Bag:
     """
-    An open bag.
+    An open bag: its folder or file, and topics with types, QoS profiles and message counts.
 
-    Attributes
-    ----------
-    path : Path
-        The folder or file.
-    connections : list of Connection
-        The topics, with types, QoS profiles and numbers of messages.
-    messages : callable
-        Yields the messages of some connections, in the order of their log times where the bag has
-        an index of log times, else in the order of the files.
-    start, end : int
-        Log times of the first and the last message [ns]; equal for an empty bag.
-    faults : tuple of Fault
-        Damage of the bag as a whole.
+    `messages` yields the messages of some connections, in the order of their log times if the bag
+    has an index, else in the order of the files.  `start` and `end` are the log times of the first
+    and the last message [ns], equal for an empty bag; `faults` the damage of the bag as a whole.
     """
 
     path: Path
@@ -91,7 +79,7 @@ class Bag:
 
 def storage_of(path: Path) -> str:
     """
-    Return which storage a file of a bag has by its name, compressed or not; empty for no bag.
+    Return the storage of a bag's file by its name, compressed or not; empty for no bag.
 
     >>> [storage_of(Path(x)) for x in ('a.mcap', 'a_0.db3.zstd', 'a.csv')]
     ['.mcap', '.db3', '']
@@ -102,7 +90,7 @@ def storage_of(path: Path) -> str:
 
 @contextmanager
 def damage_as_data_error(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged bag provokes into a `DataError` that names the bag."""
+    """Turn any error of a reader over a damaged bag into a `DataError` that names the bag."""
     try:
         yield
     except DataError:
@@ -117,7 +105,7 @@ def damage_as_data_error(path: Path) -> Iterator[None]:
 
 
 def metadata(folder: Path) -> dict[str, Any]:
-    """Return the contents of the ``metadata.yaml`` of a folder; ConfigError for no YAML."""
+    """Return the contents of a folder's ``metadata.yaml``; ConfigError if it is no YAML."""
     info = load_yaml(folder / 'metadata.yaml').get('rosbag2_bagfile_information')
     return info if isinstance(info, dict) else {}
 
@@ -139,7 +127,7 @@ def _storage_files(path: Path) -> list[Path]:
         try:
             listed = [path / Path(name).name for name in metadata(path)['relative_file_paths']]
         except (ConfigError, TypeError, KeyError):
-            return []  # opening it meets the same
+            return []  # opening the bag refuses the file
         return [file for file in listed if file.exists()]
     files = [f for f in sorted(path.iterdir()) if storage_of(f)]
     if not files:
@@ -174,12 +162,9 @@ def _is_cut_off(file: Path) -> bool:
 
 
 def _sidecars(file: Path) -> list[Path]:
-    """Return the journals beside a database that hold something."""
+    """Return the journals beside a database that are not empty."""
     beside = [file.with_name(file.name + end) for end in _SIDECARS]
     return [s for s in beside if s.is_file() and s.stat().st_size]
-
-
-# --- recovery -------------------------------------------------------------------------------
 
 
 class _Part(NamedTuple):
@@ -240,7 +225,7 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
 
 
 def unpacked(messages: Iterable[Stored], path: Path) -> Iterator[Stored]:
-    """Yield messages; those that were compressed one by one are unpacked and sorted again."""
+    """Yield messages; messages that were compressed one by one are unpacked and sorted."""
     held: list[tuple[int, int, Stored]] = []
     for i, message in enumerate(messages):
         if message.raw[:4] != _ZSTD:
@@ -264,9 +249,9 @@ def _unpacked_file(file: Path, stack: ExitStack) -> Path:
     try:
         with file.open('rb') as source, copy.open('wb') as target:
             zstd = library('zstandard', file).ZstdDecompressor()
-            reader = zstd.stream_reader(source, read_across_frames=True)
-            while part := reader.read(_UNPACKED):
-                target.write(part)
+            shutil.copyfileobj(
+                zstd.stream_reader(source, read_across_frames=True), target, 1 << 22
+            )
     except OSError as error:
         raise DataError(
             f'{file}: cannot be unpacked in {copy.parent.parent} ({error.strerror}); make room, '
@@ -280,35 +265,17 @@ def _work_folder(stack: ExitStack) -> Path:
 
 
 def _mcap_part(file: Path) -> _Part:
-    scan = _McapScan(file)
-    counted: dict[tuple[str, str], Connection] = {}
-    start, end = 2**63 - 1, 0
-    for connection, stamp, _ in scan.messages():
-        key = (connection.topic, connection.msgtype)
-        old = counted.get(key, connection)
-        counted[key] = old._replace(msgcount=old.msgcount + 1)
-        start, end = min(start, stamp), max(end, stamp)
-    is_whole = scan.is_whole and not _is_cut_off(file)
-    lacking = '' if is_whole else f'the end of {file.name} is missing'
-    return _Part(list(counted.values()), scan.messages, start, end, lacking)
+    """Read an mcap file from its beginning by the package `mcap`, as far as chunks are whole."""
+    # no ROS distribution packages it, so it may not be there
+    kinds = library('mcap.records', file, 'mcap')
+    stream_reader = library('mcap.stream_reader', file, 'mcap')
+    ended: list[bool] = []
 
-
-class _McapScan:
-    """An mcap file read from its beginning by the package `mcap`."""
-
-    def __init__(self, file: Path) -> None:
-        self.is_whole = False
-        self._file = file
-
-    def messages(self) -> Iterator[Stored]:
-        """Yield the messages of every whole chunk."""
-        # no ROS distribution packages it, so it may not be there
-        kinds = library('mcap.records', self._file, 'mcap')
-        stream_reader = library('mcap.stream_reader', self._file, 'mcap')
+    def messages() -> Iterator[Stored]:
         schemas: dict[int, Any] = {}
         connections: dict[int, Connection] = {}
-        size = self._file.stat().st_size
-        with self._file.open('rb') as stream:
+        size = file.stat().st_size
+        with file.open('rb') as stream:
             reader = stream_reader.StreamReader(stream, validate_crcs=True, record_size_limit=size)
             try:
                 for record in reader.records:
@@ -316,19 +283,27 @@ class _McapScan:
                         schemas[record.id] = record
                     elif isinstance(record, kinds.Channel):
                         if record.message_encoding == 'cdr':
-                            schema = schemas[record.schema_id]
-                            connections[record.id] = _connection(record, schema)
+                            connections[record.id] = _connection(record, schemas[record.schema_id])
                     elif isinstance(record, kinds.Message):
                         if record.channel_id in connections:
-                            yield Stored(
-                                connections[record.channel_id], record.log_time, record.data
-                            )
+                            connection = connections[record.channel_id]
+                            yield Stored(connection, record.log_time, record.data)
                     elif isinstance(record, kinds.DataEnd):
-                        self.is_whole = True
+                        ended.append(True)
                         return
             # struct, zstd, lz4 and mcap have errors of their own for a file that ends too early
             except Exception:  # noqa: BLE001
                 return
+
+    counted: dict[tuple[str, str], Connection] = {}
+    start, end = 2**63 - 1, 0
+    for connection, stamp, _ in messages():
+        key = (connection.topic, connection.msgtype)
+        old = counted.get(key, connection)
+        counted[key] = old._replace(msgcount=old.msgcount + 1)
+        start, end = min(start, stamp), max(end, stamp)
+    lacking = '' if ended and not _is_cut_off(file) else f'the end of {file.name} is missing'
+    return _Part([*counted.values()], messages, start, end, lacking)
 
 
 def _connection(channel: Any, schema: Any) -> Connection:

@@ -5,22 +5,24 @@
 Bags: a whole record, or messages as they arrive, which are on disk soon after.
 
 rosbags itself keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until
-it is closed.  The two calls that end a chunk and a transaction early are internals of it, so they
-are looked for before the first message, and `setup.py` bounds the version.
+the bag is closed.  rosbags also writes its own name for the distribution, and no hash of the type
+into an mcap channel.  The calls that end a chunk or a transaction early, and the storage to which
+`JazzyWriter` adds name and hash, are internals of rosbags: `setup.py` bounds the version.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
+from io import BytesIO
 import os
 from pathlib import Path
 import sqlite3
 from typing import Any, cast
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output, unwritable
-from piezo_ident.record.bags.jazzy import JazzyWriter
+from piezo_ident.common.files import temporary_output, unwritable, write_text
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
 from piezo_ident.record.channels import quantity_of_channel
@@ -34,11 +36,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import storage_mcap, StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-#: how many numbered names are tried
+#: the message types belong to this distribution
+DISTRIBUTION = 'jazzy'
+#: most numbered names that are tried
 NAMES = 10_000
 
 _FOREVER = QosTime(9223372036, 854775807)
@@ -56,6 +60,46 @@ SAMPLE_QOS = Qos(
 )
 
 
+class JazzyWriter(Writer):
+    """Writer of bags with the distribution and the type hashes that rosbag2 of Jazzy writes."""
+
+    def open(self) -> None:
+        """Open the bag, and put the additions between it and its storage."""
+        super().open()
+        storage: Any = self.storage
+        close = storage.close
+        storage.close = lambda version, metadata: close(version, _named(metadata))
+        if self.storage_plugin == StoragePlugin.MCAP:
+            storage.add_connection = partial(_add_channel, storage, storage.add_connection)
+        else:
+            storage.conn.execute('UPDATE schema SET ros_distro = ?', (DISTRIBUTION,))
+
+    def close(self) -> None:
+        """Finish the bag, and name the distribution in its metadata."""
+        super().close()
+        write_text(self.metapath, _named(self.metapath.read_text('utf8')))
+
+
+def _named(metadata: str) -> str:
+    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
+
+
+def _add_channel(
+    storage: Any, add: Callable[[Connection, str], None], connection: Connection, qos: str
+) -> None:
+    """Add a channel whose metadata hold the hash of the type beside the QoS."""
+    chunk, begin = storage.chunk.bio, storage.chunk.bio.tell()
+    add(connection, qos)
+    metadata = BytesIO()
+    metadata.write(storage.channels[-1].metadata)
+    for text in ('topic_type_hash', connection.digest):
+        storage_mcap.write_string(metadata, text)
+    storage.channels[-1] = storage.channels[-1]._replace(metadata=metadata.getvalue())
+    # written once more, longer
+    chunk.seek(begin)
+    storage_mcap.write_channel(chunk, storage.channels[-1], storage.schemas)
+
+
 def knows_type(name: str) -> bool:
     """Return whether a message type can be described in a bag."""
     return name in typestore().fielddefs
@@ -65,19 +109,20 @@ class BagWriter:
     """
     An open bag, or several one after the other; all calls must come from one thread.
 
-    With a `max_size` a recording has several parts.  Each part is a whole bag with all topics.
-    The parts are numbered in their names; their custom data hold ``part`` and ``recording``.
+    A recording with a `max_size` [bytes on disk] has several parts: `flush` closes a part of that
+    size and begins the next.  Each part is a whole bag with all topics.  The parts are numbered in
+    their names; their custom data hold ``part`` and ``recording``.  DataError if a bag cannot be
+    made.
 
     Parameters
     ----------
     path : path
-        The folder to make; a number is added when it is there.
+        The folder to make; a taken name gets a number.
     storage : {'mcap', 'sqlite3'}
-        Format.
     custom_data : mapping of str to str, optional
         For the bag's metadata.
     max_size : int, optional
-        Bytes on disk from which `flush` closes the bag and begins the next; 0 for one bag.
+        0 for one bag.
 
     Attributes
     ----------
@@ -86,12 +131,7 @@ class BagWriter:
     file : Path
         The file that is being written.
     messages : int
-        How many were written, all parts together.
-
-    Raises
-    ------
-    DataError
-        When a bag cannot be made.
+        Number of written messages, all parts together.
     """
 
     def __init__(
@@ -104,7 +144,7 @@ class BagWriter:
         self.max_size = max_size
         self.messages = 0
         self.parts: list[Path] = []
-        # made whole, so that a later change of the working directory changes nothing
+        # absolute: the working directory may change
         self._path = Path(os.path.abspath(Path(path).expanduser()))
         self._storage = storage
         self._custom_data = dict(custom_data or {})
@@ -139,7 +179,7 @@ class BagWriter:
 
     def _opened(self) -> JazzyWriter:
         path, begin = self._path, self._number + 1 if self.parts else 0
-        # from the last one on: a week has more parts than names are tried
+        # from the last number on: a week has more parts than tried names
         for number in range(begin, begin + NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
             try:
@@ -178,11 +218,7 @@ class BagWriter:
         return topic in self._topics
 
     def add_topic(self, topic: str, message_type: str, qos: Sequence[Qos] = (SAMPLE_QOS,)) -> None:
-        """
-        Add a topic by its full name, once, with what its publishers offer.
-
-        DataError when the type is none of Jazzy's, or the bag cannot be written any more.
-        """
+        """Add a topic by its full name, once; DataError for a type that Jazzy does not know."""
         if not knows_type(message_type):
             raise DataError(f'{topic}: type {message_type} is not known here; leave the topic out')
         self._topics[topic] = (message_type, tuple(qos))
@@ -196,21 +232,16 @@ class BagWriter:
             )
 
     def write(self, topic: str, stamp: int, raw: bytes) -> None:
-        """
-        Write a serialised message under its log time [ns] on a topic that was added.
-
-        DataError when the bag cannot be written any more.
-        """
+        """Write a serialised message with its log time [ns]; DataError for a full disk."""
         with self._disk_errors():
             self._writer.write(self._connections[topic], stamp, raw)
         self.messages += 1
 
     def flush(self) -> None:
         """
-        Hand all that was written to the system, so that no end of this process loses it.
+        Hand all messages to the system, so that no end of this process loses them.
 
-        The next part is begun when it is time.  DataError when that cannot be made, or the bag
-        cannot be written any more.
+        A full part is closed and the next one begun.  DataError if a bag cannot be written.
         """
         with self._disk_errors():
             self._hand_over()
@@ -222,11 +253,7 @@ class BagWriter:
             self._closed_size, self._closed_messages = size, self.messages
 
     def close(self) -> None:
-        """
-        Finish the bag: index and metadata.yaml.
-
-        DataError when that cannot be written; what was written before can be recovered.
-        """
+        """Write index and metadata.yaml; after a DataError the messages can be recovered."""
         try:
             with self._disk_errors():
                 self._writer.close()
@@ -254,7 +281,7 @@ class BagWriter:
 
 
 def _hand_over(storage: Any, name: str) -> Callable[[], None]:
-    """Return what puts all messages on disk; AttributeError where this rosbags cannot."""
+    """Return a function that puts all messages on disk; AttributeError if rosbags has none."""
     if name == 'sqlite3':
         return cast(Callable[[], None], storage.conn.commit)
     close_chunk, flush, _ = storage.close_chunk, storage.bio.flush, storage.chunk.bio.tell
@@ -279,11 +306,11 @@ def write_bag(
     """
     Write a record as a rosbag2 folder, or as a single file when `path` ends in .mcap or .db3.
 
-    A block's log time is the time of its first sample.  Log times have to be positive and to rise:
-    whole seconds are added where the record starts before zero or its clock restarts.  The samples
-    keep their own times.  The storage of a folder is
-    mcap or sqlite3, mcap by default; the custom data, such as seed and program, join the
-    ``sample_rate`` in the metadata.  DataError when the place is taken or cannot be written to.
+    The log time of a block is the time of its first sample.  Log times have to be positive and to
+    rise: whole seconds are added to them if the record starts before zero or its clock restarts.
+    The samples keep their own times.  The `storage` of a folder is mcap or sqlite3, mcap by
+    default; the custom data, such as seed and program, join the ``sample_rate`` in the metadata.
+    DataError if the place is taken or cannot be written to.
     """
     path = Path(path)
     suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
@@ -310,15 +337,14 @@ def write_bag(
 
 
 def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
-    quantities = ['voltage', 'displacement']
-    quantities += dict.fromkeys(quantity_of_channel(k) for p in record for k in p.channels)
-    senders = {q: _sender(writer, q) for q in quantities}
+    further = dict.fromkeys(quantity_of_channel(k) for p in record for k in p.channels)
+    senders = {q: _sender(writer, q) for q in ('voltage', 'displacement', *further)}
     shift, latest = 0, 0.0
     for piece in record:
         columns = {'voltage': piece.v, 'displacement': piece.y}
         columns |= {quantity_of_channel(k): x for k, x in piece.channels.items()}
         first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
-        # later by whole seconds, until nothing is before what was written already
+        # later by whole seconds, until the piece follows the piece before
         while first + shift < latest:
             shift += 1 + int(latest - first - shift)
         latest = last + shift

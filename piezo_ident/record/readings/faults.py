@@ -2,22 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Readings that cannot be the stage's, though every number is in order: one mask, decided once.
+Lost, wild, repeated and stuck readings: one mask, decided once.
 
-A reading is lost, wild, repeated or stuck.  The mask of a piece leaves it out of every fit, error,
-noise floor and stroke.  A straight line stands in for it where a filter or a regression needs all
-samples.
+Every number of such a reading is in order, but it is no displacement of the stage.  The mask of a
+piece leaves it out of every fit, error, noise floor and stroke.  A straight line replaces it for
+filters and regressions, which need all samples.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, interpolated, Mask, robust_range, true_runs
+from piezo_ident.common.arrays import Array, CHUNK, interpolated, Mask, robust_range, true_runs
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.ordering import at_times
 from piezo_ident.record.readings.jumps import (
@@ -32,48 +30,46 @@ from piezo_ident.record.readings.jumps import (
 )
 from piezo_ident.record.record import Fault, Piece, Record
 
-Runs = list[tuple[int, int]]
-
-#: samples in a row with one and the same displacement that are no chance
+#: so many samples in a row with one displacement are no chance
 STUCK = 50
-#: samples looked at together, so that temporaries stay small beside a long record
-_CHUNK = 1 << 20
-#: share of its range by which the voltage moves meanwhile
+#: the voltage moves by this share of its range while a sensor is stuck
 MOVED = 0.01
 #: the voltage is ahead of the displacement by this time at most [s]
 DELAY = 0.002
-#: share of the stroke to either end that is not the middle, of the range of the voltage that moves
-#: any stage there
-MIDDLE, FIRM = 0.02, 0.03
-#: samples in which noise is looked for
+#: share of the stroke at either end of its middle
+MIDDLE = 0.02
+#: share of the range of the voltage that moves any stage in the middle of its stroke
+FIRM = 0.03
+#: samples of a window that shows noise
 WINDOW = 100
-#: readings of one value in a row that may be a sensor that hangs
+#: least readings of one value in a row of a sensor that hangs
 HELD = 2 * JUMP
-#: a repeat is looked for where chance makes one of so many, and y moves by this share a sample
+#: repeats are sought in motion that repeats by chance one reading in 1 / CHANCE, and that goes
+#: this share of the stroke a sample
 CHANCE, CREEPS = 0.01, 3e-5
-#: repeats in a moving signal: at least so many, and this share of the samples that move; share of
-#: them behind which the signal makes up for them
-REPEATS, REPEATED, MADE_UP = 4, 2e-4, 0.7
-#: samples in which the step of a converter is looked for, in rows of so many
+#: least number of repeats in a moving signal, and least share of the moving samples
+REPEATS, REPEATED = 4, 2e-4
+#: least share of the repeats behind which the signal makes up for them
+MADE_UP = 0.7
+#: samples that tell the step of a converter, in rows of so many
 MOST, MOST_ROW = 2**17, 2**10
 #: share of that step by which numbers in a file may be rounded
 ROUNDED = 0.07
-#: where more of a record than this looks wrong, wild readings and ones that are held or repeated,
-#: it is the way of the data
+#: larger shares of wild readings, or of held and repeated readings, are the way of the data
 MAX_WILD, MAX_HELD = 0.15, 0.3
-#: times that the stroke is read again without what was wild
+#: the stroke is read so often without wild readings
 TURNS = 5
-#: changes of a displacement, at least, that tell the rate of its sensor
+#: least changes of a displacement that tell the rate of its sensor
 CHANGES = 100
 
 
 def without_faults(record: Record) -> Record:
     """
-    Return a record whose masks leave out the readings that cannot be the stage's.
+    Return a record whose masks leave out the readings that are no displacement of the stage.
 
-    A straight line stands in for them, and for the voltage of a row that was lost as a whole.
-    In a channel with the displacement of another axis they become NaN.  The faults of the record
-    count them.  The same record comes back without any, or when its masks were decided before.
+    A straight line replaces them, and the voltage of a row that was lost as a whole.  They become
+    NaN in a channel with the displacement of another axis.  The faults of the record count them.
+    A record without them, or with masks, comes back as it is.
     """
     if any(piece.sound is not None for piece in record):
         return record
@@ -82,7 +78,7 @@ def without_faults(record: Record) -> Record:
 
 
 def _without_faults_of(record: Record, name: str) -> Record:
-    """Return a record whose channel `name`, the displacement of another axis, is judged too."""
+    """Return a record without the faults of channel `name`, the displacement of another axis."""
     has = [i for i, p in enumerate(record) if np.isfinite(p.channels.get(name, np.nan)).all()]
     if not has:
         return record
@@ -109,53 +105,48 @@ def _without_faults_of(record: Record, name: str) -> Record:
 
 
 def _without_own_faults(record: Record) -> Record:
-    """Return a record whose displacement is judged."""
+    """Return a record without the faults of its own displacement."""
     if record.stroke == 0.0:
         return record
     span = float(np.ptp(record.voltage_range))
     stroke = record.stroke
     wild = [_wild(piece, stroke, span) for piece in record]
     for _ in range(TURNS):
-        # many lost readings widen what is taken for the stroke
+        # many lost readings widen the range
         both = zip(record, wild, strict=True)
         low, high = robust_range(interpolated(piece.y, bad) for piece, bad in both)
         if high - low > 0.9 * stroke:
             break
         stroke = high - low
         wild = [_wild(piece, stroke, span) for piece in record]
-    found: list[dict[str, Mask]] = []
+    masks: dict[str, list[Mask]] = {'lost': [], 'outliers': [], 'stuck': [], 'missed_samples': []}
     for piece, bad in zip(record, wild, strict=True):
         rest = replace(piece, y=interpolated(piece.y, bad))
-        lost = bad & (piece.y == 0.0)
-        stuck = _held(rest, stroke, span) & ~bad
-        repeated = _repeated(rest.y, bad | stuck)
-        found.append(
-            {'lost': lost, 'outliers': bad & ~lost, 'stuck': stuck, 'missed_samples': repeated}
-        )
-    counts = Counter({name: sum(int(one[name].sum()) for one in found) for name in found[0]})
-    hangs = counts['stuck'] + counts['missed_samples']
-    is_way = hangs > MAX_HELD * record.n or counts.total() - hangs > MAX_WILD * record.n
-    if not counts.total() or is_way:
+        lost, stuck = bad & (piece.y == 0.0), _held(rest, stroke, span) & ~bad
+        kinds = lost, bad & ~lost, stuck, _repeated(rest.y, bad | stuck)
+        for found, mask in zip(masks.values(), kinds, strict=True):
+            found.append(mask)
+    counts = {name: sum(int(mask.sum()) for mask in found) for name, found in masks.items()}
+    wilds, hangs = counts['lost'] + counts['outliers'], counts['stuck'] + counts['missed_samples']
+    is_way = hangs > MAX_HELD * record.n or wilds > MAX_WILD * record.n
+    if is_way or not wilds + hangs:
         return record
-    masks = [np.logical_or.reduce(list(one.values())) for one in found]
-    pieces = [_masked(p, bad, span) for p, bad in zip(record, masks, strict=True)]
-    faults = [_fault(name, count, record, found) for name, count in counts.items() if count]
-    return replace(record, pieces=tuple(pieces), faults=(*record.faults, *faults))
-
-
-def _fault(name: str, count: int, record: Record, found: Sequence[dict[str, Mask]]) -> Fault:
-    times = [
-        float(piece.time(a, a + 1)[0])
-        for piece, one in zip(record, found, strict=True)
-        for a, _ in true_runs(one[name])
-    ]
-    what = {'stuck': 'the sensor hangs, ', 'missed_samples': 'repeat the reading before, '}
-    action = f'{what.get(name, "")}left out of every fit and error; the voltage is kept'
-    return Fault(name, at_times(np.array(times)), count, action)
+    bads = (np.logical_or.reduce(kinds) for kinds in zip(*masks.values(), strict=True))
+    pieces = tuple(_masked(p, bad, span) for p, bad in zip(record, bads, strict=True))
+    faults = []
+    for name, found in masks.items():
+        firsts = [
+            (p, a) for p, mask in zip(record, found, strict=True) for a, _ in true_runs(mask)
+        ]
+        where = at_times(np.array([float(p.time(a, a + 1)[0]) for p, a in firsts]))
+        what = {'stuck': 'the sensor hangs, ', 'missed_samples': 'repeat the reading before, '}
+        action = f'{what.get(name, "")}left out of every fit and error; the voltage is kept'
+        faults += [Fault(name, where, counts[name], action)] if firsts else []
+    return replace(record, pieces=pieces, faults=(*record.faults, *faults))
 
 
 def _masked(piece: Piece, bad: Mask, span: float) -> Piece:
-    """Return a piece with a mask, and straight lines for what it leaves out."""
+    """Return a piece with a mask, and straight lines for the readings it leaves out."""
     if not bad.any():
         return piece
     v = piece.v
@@ -168,13 +159,12 @@ def _masked(piece: Piece, bad: Mask, span: float) -> Piece:
 
 
 def _wild(piece: Piece, stroke: float, span: float) -> Mask:
-    """Return which readings of a piece jump away and come back while the voltage does not."""
+    """Mark the readings of a piece that jump away and come back while the voltage does not."""
     y = piece.y
-    ranges = {k: np.ptp(x) for k, x in piece.channels.items() if role_of(k) == 'v'}
-    # the voltages as the displacement [m] that they ask for; other axes may move this one, too
+    # the voltages as the displacement [m] that they ask for; other axes may move this axis, too
     asked = np.zeros(y.size)
-    signals = [(piece.v, span), *((piece.channels[k], float(ranges[k])) for k in ranges)]
-    for v, width in signals:
+    others = [x for k, x in piece.channels.items() if role_of(k) == 'v']
+    for v, width in ((piece.v, span), *((x, float(np.ptp(x))) for x in others)):
         if width > 0.0:
             steps = np.abs(np.diff(interpolated(v, (v == 0.0) & (y == 0.0)), prepend=v[0]))
             asked = np.maximum(asked, steps * (stroke / width))
@@ -185,7 +175,7 @@ def _wild(piece: Piece, stroke: float, span: float) -> Mask:
 
 
 def _marked(y: Array, bad: Mask, least: float) -> Mask:
-    """Return which readings are bad, and all that have the one value that many bad ones have."""
+    """Return a mask of the bad readings, and of all readings with a value of many bad ones."""
     values, counts = np.unique(y[bad], return_counts=True)
     values = values[counts >= REPEATS]
     if not values.size:
@@ -195,10 +185,8 @@ def _marked(y: Array, bad: Mask, least: float) -> Mask:
         same = y == value
         # a rest, and a code that the signal passes as it does its neighbours, are no mark
         for a, b in constant(y, HELD):
-            jumps = np.abs(y[[a, min(b, y.size - 1)]] - y[[max(a - 1, 0), b - 1]]) > max(
-                least, CODES * quantum
-            )
-            same[a:b] &= bool(jumps.all())
+            jumps = np.abs(y[[a, min(b, y.size - 1)]] - y[[max(a - 1, 0), b - 1]])
+            same[a:b] &= bool(jumps.min() > max(least, CODES * quantum))
         beside = np.count_nonzero((np.abs(y - value) <= 2.5 * quantum) & (y != value)) / 4
         if np.count_nonzero(same & ~bad) > REPEATS + 3.0 * beside:
             marked |= same
@@ -207,21 +195,16 @@ def _marked(y: Array, bad: Mask, least: float) -> Mask:
 
 def _held(piece: Piece, stroke: float, span: float) -> Mask:
     """
-    Return where the reading stays at one value, and jumps at the end to make up for it.
+    Mark readings that stay at one value, and jump at the end to make up for it.
 
     A stage at rest, at the end of its range, or behind a saturated amplifier has no such jump.
-    Readings that tremble do not stay in the middle of the range while the voltage moves far; else
-    a backlash may hold them.
+    Readings with noise that stay in the middle of the range while the voltage moves far hang, too.
+    A backlash may hold readings without noise.
     """
     y, v = piece.y, piece.v
     found = np.zeros(y.size, dtype=bool)
     # a slow sensor holds every reading
-    period = period_of(y)
-    runs = [
-        (a, b)
-        for a, b in constant(y, HELD * period if period > 1 else HELD)
-        if a > 0 and b < piece.n
-    ]
+    runs = [(a, b) for a, b in constant(y, HELD * period_of(y)) if a > 0 and b < piece.n]
     if not runs or not span:
         return found
     floor = least_jump(y, stroke)
@@ -235,18 +218,18 @@ def _held(piece: Piece, stroke: float, span: float) -> Mask:
         drive = float(np.ptp(v[a : end_of_rest(piece, a, b)])) / span
         hangs = drive > MOVED and abs(leave) > max(least, 0.3 * drive * stroke)
         if trembles and drive > FIRM and min(abs(y[a] - end) for end in ends) > MIDDLE * stroke:
-            # for most of the time, as a delay may be long
+            # without both ends, as a delay may be long
             reach = float(np.ptp(np.quantile(v[a:b], (0.1, 0.9)))) / span
             hangs |= b - a >= STUCK and reach > FIRM and 0.3 * reach * stroke > floor
         if hangs:
-            # what hangs repeats the last good reading, unless it jumped there
+            # the first reading of a run is good, unless it jumped there
             found[a if abs(entry) > least else a + 1 : b] = True
     return found
 
 
 def _trembles(y: Array) -> bool:
-    """Return whether noise turns the readings, shape (n,), back and forth where they rest."""
-    steps = np.diff(y[:_CHUNK])
+    """Return whether noise turns readings at rest, shape (n,), back and forth."""
+    steps = np.diff(y[:CHUNK])
     # noise below the step of a converter turns two codes at their limit, and holds one between
     far = np.abs(steps[1:]) > 1.5 * quantum_of(y)
     turns = steps[1:] * steps[:-1] < 0.0
@@ -258,9 +241,9 @@ def _trembles(y: Array) -> bool:
 
 def _repeated(y: Array, known: Mask) -> Mask:
     """
-    Return readings equal to the one before where those around say that the position moved.
+    Mark readings that equal the reading before while their neighbours say that y moved.
 
-    The slope is that between the readings before and after the equal ones.
+    The neighbours are the readings before and after the equal ones.
     """
     n = y.size
     found = np.zeros(n, dtype=bool)
@@ -299,7 +282,7 @@ def _repeated(y: Array, known: Mask) -> Mask:
 
 
 def white_noise(third: Array, quantum: float) -> float:
-    """Return the rms of the noise of readings, from their third differences and their step."""
+    """Return the rms of the noise of readings, by their third differences and their step."""
     size = np.abs(third) / np.sqrt(20.0)
     if size.size == 0:
         return 0.0
@@ -310,35 +293,39 @@ def white_noise(third: Array, quantum: float) -> float:
 
 
 def end_of_rest(piece: Piece, a: int, b: int) -> int:
-    """Return where a rest of the displacement ends for the voltage, which is ahead by a delay."""
+    """Return the end of a rest of the displacement for the voltage, which is ahead by a delay."""
     return b - min((b - a) // 4, round(DELAY * piece.sample_rate))
 
 
 def period_of(y: Array) -> int:
-    """Return every how many samples a displacement, shape (n,), has a new reading."""
+    """Return the number of samples from one new reading of y, shape (n,), to the next."""
     changes = np.flatnonzero(np.diff(y))
     return int(np.gcd.reduce(np.diff(changes))) if changes.size > CHANGES else 1
 
 
-def constant(x: Array, least: int = STUCK) -> Runs:
-    """Return the stretches of at least so many equal samples."""
+def constant(x: Array, least: int = STUCK) -> list[tuple[int, int]]:
+    """Return the runs of at least so many equal samples."""
     return [(a, b + 1) for a, b in true_runs(x[1:] == x[:-1]) if b + 1 - a >= least]
 
 
 def quantum_of(y: Array) -> float:
-    """Return the step of which all readings y, shape (n,), are multiples; 0 for none."""
+    """Return the converter's step that divides all readings y, shape (n,); 0 without a step."""
     span = float(np.ptp(y))
     if span == 0.0:
         return 0.0
+    # some whole stretches of a long signal tell the step as well
+    some = y
+    if y.size > MOST:
+        rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
+        some = rows[:: max(1, y.size // MOST)].ravel()
     # neighbours in time differ by few steps, so the rounding of numbers does not add up
-    some = _pieces(y)
     jumps = np.abs(np.diff(some))
     # the ends of a clipped range need not be codes
     inner = (some > y.min()) & (some < y.max())
     jumps = jumps[(jumps > 1e-9 * span) & inner[1:] & inner[:-1]]
     usual = float(np.median(jumps)) if jumps.size > 20 else 0.0
     if usual > 0.0 and np.mean(np.abs(jumps - usual) < 1e-6 * usual) > 0.98:
-        # one step at a time, and where a sensor hung or samples are missing a whole number of them
+        # one step at a time, or a whole number of steps behind missing samples
         ratio = jumps / usual
         if np.all(np.abs(ratio - np.rint(ratio)) < 1e-3):
             return usual
@@ -355,7 +342,7 @@ def quantum_of(y: Array) -> float:
     step = float(small[0])
     for _ in range(4):
         fitted = step
-        # rounded numbers tell the step the better the further they are apart
+        # rounded numbers far apart tell the step better
         for most in (1.5, 5.0, 15.0, 50.0):
             near = small < most * fitted
             whole = np.rint(small[near] / fitted)
@@ -365,18 +352,10 @@ def quantum_of(y: Array) -> float:
         off = np.abs(small[near] / fitted - whole)
         if near.sum() >= 2 and np.mean(off < ROUNDED) > 0.97:
             return fitted
-        # a code in between was never hit: the step divides the differences of differences
+        # the signal missed a code in between: the step divides differences of differences
         gaps = np.diff(small)
         gaps = gaps[gaps > 0.03 * step]
         if gaps.size == 0 or float(gaps.min()) > 0.97 * step:
             return 0.0
         step = float(gaps.min())
     return 0.0
-
-
-def _pieces(y: Array) -> Array:
-    """Return some whole stretches of a long signal, which tell the step as well."""
-    if y.size <= MOST:
-        return y
-    rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
-    return np.asarray(rows[:: max(1, y.size // MOST)].ravel())

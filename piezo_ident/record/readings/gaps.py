@@ -5,9 +5,9 @@
 Short gaps in a record, bridged for fitting.
 
 Reading splits a record wherever samples are missing, but the stage keeps its memory: in a short
-gap the voltage moves on to its next value, and the plays with it.  Pieces of one clock are joined
-by straight lines.  Where the displacement alone is missing, however long, the voltage joins them.
-Every fit and every error leaves out a gap, and the moment after it.
+gap the voltage moves on to its next value, and the plays with it.  Straight lines join pieces of
+one clock.  If the displacement alone is missing, the voltage joins pieces over any time.  Every
+fit and every error leaves out a gap, and the moment after it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from piezo_ident.record.record import Piece, Record, Segment
 
 #: longest gap that is bridged by a straight line [s]
 LONGEST = 1.0
-#: lost readings in a row over which a regression or a spectrum may run
+#: a regression or a spectrum may run over so many lost readings in a row
 FEW = 9
-#: time after a gap in which the dynamics may still answer to what was not measured [s]
+#: time after a gap in which the dynamics still answer to the voltage in the gap [s]
 SETTLING = 0.01
 
 
@@ -32,9 +32,8 @@ class Bridged:
     """
     A piece with its gaps filled.
 
-    `sound` are the samples that were measured, are no fault, and at which a gap before them has
-    died away;
-    `gaps` and `filled` are the number of gaps without a voltage, and of samples in them.
+    `sound` samples were measured without a fault, and a gap before them has died away.  `gaps` and
+    `filled` count the gaps without a voltage, and their samples.
     """
 
     piece: Piece
@@ -44,7 +43,7 @@ class Bridged:
 
 
 def follows(one: Piece, other: Piece) -> int | None:
-    """Return how many samples are missing between two pieces, None where they do not connect."""
+    """Return the number of samples that are missing between pieces; None for other clocks."""
     if abs(other.sample_rate / one.sample_rate - 1.0) > 1e-6:
         return None
     elapsed = (other.start_time - one.start_time) * one.sample_rate
@@ -57,7 +56,7 @@ def follows(one: Piece, other: Piece) -> int | None:
 
 
 def played_before(one: Piece, other: Piece) -> Piece | None:
-    """Return the samples between two pieces where all but their displacement is known."""
+    """Return the samples between two pieces whose displacement alone is unknown."""
     before = other.before
     return before if before is not None and before.n == follows(one, other) else None
 
@@ -75,7 +74,7 @@ def connected_pieces(record: Record) -> list[list[Piece]]:
 
 
 def bridged(record: Record) -> list[Bridged]:
-    """Join the pieces of a record over short gaps, one for each of `connected_pieces`."""
+    """Join each group of `connected_pieces` of a record over its short gaps."""
     return [_joined(group) for group in connected_pieces(record)]
 
 
@@ -127,7 +126,7 @@ def _joined(pieces: list[Piece]) -> Bridged:
 
 
 def _segments(pieces: list[Piece], starts: list[int]) -> tuple[Segment, ...]:
-    """Return the segments on the joined clock; one that goes on behind a gap stays one."""
+    """Return the segments on the joined clock; a gap does not end a segment."""
     found: list[Segment] = []
     end = 0
     for piece, start in zip(pieces, starts, strict=True):

@@ -2,58 +2,61 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Readings that jump away from a signal and come back: what a sound signal does not do.
+Readings that jump away from a signal and come back, as a sound signal does not.
 
-Jumps are steps far beyond those around them.  They cut the signal into parts, of which some are
-left out, at the least cost.  A sample left out costs 1.  A jump that is kept costs `JUMP`, or 0
-where the voltage explains it.  A part that goes on where the last kept part ended costs 0.
+Jumps are steps far beyond the steps around them.  They cut the signal into parts.  The parts to
+leave out are those of least cost.  A sample left out costs 1.  A jump that is kept costs `JUMP`,
+or 0 if the voltage explains it.  A part that goes on at the end of the last kept part costs 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers, interpolated, Mask, true_runs
+from piezo_ident.common.arrays import Array, CHUNK, Integers, interpolated, Mask, true_runs
 from piezo_ident.common.kernel import kernel
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
-#: a jump has this share of the stroke at least, and so many times the usual step of so many
-#: samples on either side (taste: white noise reaches 6.7 times its median step)
-LEAST, FAR, AROUND = 2e-3, 8.0, 16
+#: least size of a jump, as a share of the stroke
+LEAST = 2e-3
+#: least size of a jump in usual steps of so many samples on either side (taste: white noise
+#: reaches 6.7 times its median step)
+FAR, AROUND = 8.0, 16
 WIDTH = 2 * AROUND + 1
-#: samples looked at together, so that temporaries stay small beside a long record
-_CHUNK = 1 << 20
-#: and so many codes of a converter, of which noise turns two
+#: least size of a jump in codes of a converter: noise turns two
 CODES = 3.0
-#: a quantile that holds where half of all steps are jumps, and the median over it, of normal ones
+#: a quantile that holds if half of all steps are jumps, and the median over it of normal steps
 QUANTILE = 0.3, 1.75
-#: ratio of the rms of second and first differences of steps without memory (white noise: 1.73, a
-#: sine of five samples a period: 1.18); share of the stroke from which steps are large
-ROUGH, LARGE = 1.3, 0.1
-#: samples that a jump costs: up to nine wild readings in a row, which two jumps enclose, are left
-#: out whether they are alike or not
+#: rms of second over first differences of steps without memory (white noise: 1.73, a sine of five
+#: samples a period: 1.18)
+ROUGH = 1.3
+#: least size of large steps, as a share of the stroke (taste)
+LARGE = 0.1
+#: samples that a jump costs: two jumps enclose up to nine wild readings in a row, alike or not
 JUMP = 5
-#: share of a signal beyond which a stretch between two jumps is no excursion
+#: an excursion between two jumps is at most this share of a signal
 LONGEST = 0.1
-#: parts behind one that may go on where it ended
+#: a part may go on at the end of one of so many parts before it
 PARTS = 256
-#: the voltage explains a jump where one step asks for this share of the jump; a stage moves by up
-#: to so many times the path that the voltage asks for, and answers a step for so many samples
-STEPS, OVER, RINGS = 0.3, 1.5, 30
+#: the voltage explains a jump if one step of it asks for this share of the jump
+STEPS = 0.3
+#: a stage moves by up to so many times the path that the voltage asks for
+OVER = 1.5
+#: a stage answers a step for so many samples
+RINGS = 30
 
 
 def least_step(y: Array) -> float:
-    """Return the least step from one reading [m] to the next, infinite where none moves."""
+    """Return the least step from one reading [m] to the next, infinite if none moves."""
     steps = np.abs(np.diff(y))
     return float(steps[steps > 0.0].min(initial=np.inf))
 
 
 def least_jump(y: Array, stroke: float) -> float:
-    """Return how far a reading must be off at least [m], noise and coarse codes considered."""
-    steps = np.abs(np.diff(y[:_CHUNK]))
+    """Return the least error of a wild reading [m], by the stroke and the usual step."""
+    steps = np.abs(np.diff(y[:CHUNK]))
     moved = steps[steps > 0.0]
     return max(LEAST * stroke, FAR * float(np.median(moved)) if moved.size else 0.0)
 
@@ -62,11 +65,11 @@ def wild_readings(
     error: Array, stroke: float, step: float = np.inf, measured: Array | None = None
 ) -> Mask:
     """
-    Return which readings are wild, of measured minus predicted displacement [m].
+    Mark the wild readings in the error, measured minus predicted displacement [m].
 
-    What the voltage does is in the prediction; `step` is the `least_step` of what was `measured`.
-    A jump of the error is a wild reading only where the measured displacement makes it: a goal out
-    of reach jumps as well.
+    The prediction holds the motion by the voltage; `step` is the `least_step` of the `measured`
+    displacement.  Only a jump of the measured displacement is a wild reading: a goal out of reach
+    jumps as well.
 
     >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
     >>> wild_readings(error, stroke=10.0).nonzero()[0]
@@ -76,7 +79,7 @@ def wild_readings(
     """
     if error.size < 2:
         return np.zeros(error.size, dtype=bool)
-    # without noise every step is wild; the codes of a coarse sensor are those of the measurement
+    # without noise every step would be wild
     noise = float(np.median(np.abs(np.diff(error))))
     codes = CODES * step if np.isfinite(step) else 0.0
     floor = max(LEAST * stroke, FAR * noise, codes)
@@ -94,9 +97,10 @@ class Jumps:
     """
     A signal y cut at its jumps.
 
-    `start` is the first sample of each part and the end of the signal; `height` the step into each
-    part, `least` how large it must be to be a jump, and `cost` what it costs to keep it.  `path`
-    is what the voltage asked for from the first sample on [m]; `delay` samples before are counted.
+    `start` are the first sample of each part and the end of the signal.  `height` is the step into
+    each part, `least` the least size of a jump there, and `cost` the cost of keeping the jump.
+    `path` is the path that the voltage asked for since the first sample [m]; the voltage may be
+    `delay` samples ahead.
     """
 
     y: Array
@@ -109,7 +113,7 @@ class Jumps:
 
     @classmethod
     def of(cls, y: Array, asked: Array, floor: float, stroke: float, delay: int = 0) -> Jumps:
-        """Cut a signal; `asked` is what the voltage asks for, from each sample to the next [m]."""
+        """Cut a signal; `asked` is the step that the voltage asks for at each sample [m]."""
         step = np.diff(y, prepend=y[:1])
         size = np.abs(step)
         # two readings cannot tell which of them is wild
@@ -118,13 +122,13 @@ class Jumps:
         # mean squares of first and second differences
         run, bend = (uniform_filter1d(d * d, WIDTH)[at] for d in (step, np.diff(step, append=0.0)))
         answered = maximum_filter1d(asked, 2 * RINGS + 1)[at] >= STEPS * usual
-        # large steps without any memory that nobody asked for are no motion, nor a usual step
+        # a motion has memory: large steps without memory or voltage are wild, not usual
         wild = (usual > LARGE * stroke) & (bend > ROUGH**2 * run) & ~answered
         usual = np.where(wild, 0.0, usual)
         far = size[at] > FAR * usual
         at = at[far]
         least = np.maximum(floor, FAR * usual[far])
-        # a step of the voltage is answered by a rise of several samples, and ringing
+        # a stage answers a step of the voltage by a rise of several samples, and ringing
         rings = np.where(asked > FAR * uniform_filter1d(asked, WIDTH), asked, 0.0)
         behind = np.maximum(_before(asked, delay), _before(rings, RINGS))[at]
         explained = behind >= STEPS * size[at]
@@ -139,7 +143,7 @@ class Jumps:
         )
 
     def left_out(self) -> Mask:
-        """Return which samples are left out."""
+        """Return a mask of the samples to leave out."""
         out = np.zeros(self.y.size, dtype=bool)
         if self.height.size == 1:
             return out
@@ -155,30 +159,25 @@ class Jumps:
         out[:] = True
         for part in kept:
             out[self.start[part] : self.start[part + 1]] = False
-        for a, b in self._excursions(kept[::-1]):
-            out[a:b] = True
-        return out
-
-    def _excursions(self, kept: Sequence[int]) -> list[tuple[int, int]]:
-        """Return long stretches between two jumps that the voltage cannot have made."""
-        paid = [i for i, j in zip(kept[1:], kept[:-1], strict=True) if i == j + 1 and self.cost[i]]
-        found: list[tuple[int, int]] = []
+        # long excursions between two jumps that the voltage cannot have made
+        paid = [i for j, i in itertools.pairwise(kept[::-1]) if i == j + 1 and self.cost[i]]
+        end = -1
         for i, j in itertools.pairwise(paid):
             a, b = int(self.start[i]), int(self.start[j])
-            # what follows an excursion is none
-            if b - a > LONGEST * self.y.size or (found and a <= found[-1][1]):
+            # the stretch behind an excursion is sound
+            if b - a > LONGEST * self.y.size or a <= end:
                 continue
             way = OVER * float(self.path[b] - self.path[max(0, a - 1 - self.delay)])
             least = float(max(self.least[i], self.least[j]))
             height = min(abs(self.height[i]), abs(self.height[j]))
             comes_back = abs(self.y[b] - self.y[a - 1]) <= least + way
             if self.height[i] * self.height[j] < 0.0 and comes_back and height > 2.0 * way + least:
-                found.append((a, b))
-        return found
+                out[a:b], end = True, b
+        return out
 
 
 def _usual(x: Array, at: Integers) -> Array:
-    """Return the median of normally distributed x >= 0 around places, whatever half of it is."""
+    """Return the median of normal x >= 0 around places; half of x may be anything."""
     if not at.size:
         return np.empty(0)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(x, AROUND, 'symmetric'), WIDTH)
@@ -189,7 +188,7 @@ def _usual(x: Array, at: Integers) -> Array:
 
 
 def _before(x: Array, most: int) -> Array:
-    """Return the largest x of each sample and up to `most` before it."""
+    """Return the largest x of each sample and of `most` samples before it."""
     return np.asarray(maximum_filter1d(x, most + 1, origin=most // 2, mode='nearest'))
 
 

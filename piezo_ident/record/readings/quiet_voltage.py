@@ -5,9 +5,9 @@
 The voltage of a record without the noise of its own measurement.
 
 Many labs record the monitor of the amplifier instead of the command.  The noise of a monitor adds
-a path of many spans in a minute, and the stage does not follow that path: laws with lags along the
-path would follow time, and a hold would be a motion.  A play as wide as the noise replaces the
-voltage where only noise moves it.  Elsewhere the voltage stays.
+a path of many spans in a minute, and the stage does not follow that path.  Laws with lags along
+the path would follow time, and a hold would be a motion.  A play as wide as the noise replaces the
+voltage as long as only noise moves it.  The voltage of a motion stays.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Fault, Piece, Record
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-#: samples of a window, and the share of the windows that may be quieter than the noise
+#: samples of a window, and share of the windows [%] that may be quieter than the noise
 WINDOW, QUIET = 100, 10.0
 #: width of the play, in standard deviations of the noise
 WIDTH = 8.0
-#: widest play, as a share of the range: beyond it the voltage is a noise that was played
+#: widest play, as a share of the range: a program plays larger noise
 MOST = 5e-3
-#: widths that the voltage moves within so many samples where it moves
+#: a moving voltage moves by so many widths within so many samples
 MOVES, AROUND = 3.0, 9
-#: samples over which the mean of what a play lags behind is put back
+#: samples over which the mean lag of a play is put back
 BACK = 300
-#: rms of second over first differences, sqrt(3) of white noise, below which it is none
+#: least rms of second over first differences of white noise; sqrt(3) is expected
 WHITE = 1.4
-#: share of the power of second differences below a fifth of the sampling rate, 0.027 of white
-#: noise, below which it is none
+#: least share of the power of second differences of white noise below a fifth of the sampling
+#: rate; 0.027 is expected
 LOW = 0.009
-#: path of noise [ranges] that does no harm
+#: harmless path of noise [ranges]
 SHORT = 0.01
 
 
 def with_quiet_voltage(record: Record) -> Record:
     """
-    Return a record whose voltage has no noise where it rests or moves slowly.
+    Return a record without noise of a voltage at rest or in slow motion.
 
-    A fault of it says how large the noise was; the same record is returned where there is none.
+    A fault of the record tells the size of the noise; a record without noise comes back as it is.
     """
     span = float(np.ptp(record.voltage_range))
     if span == 0.0 or any(fault.name == 'voltage_noise' for fault in record.faults):
         return record
-    # a monitor is noisy in all pieces: what one alone has was played
+    # a monitor is noisy in all pieces: a program plays the noise of a single piece
     long = [piece.v for piece in record if piece.n >= 3 * WINDOW]
     deviation = min(map(_deviation, long), default=0.0)
     width = WIDTH * deviation
@@ -70,17 +70,17 @@ def with_quiet_voltage(record: Record) -> Record:
 
 def _deviation(v: Array) -> float:
     """Return the standard deviation of white noise [V] in the quietest parts of a voltage."""
-    # of a smooth motion little is left
+    # differences leave little of a smooth motion
     one, two = (
         d[: d.size // WINDOW * WINDOW].reshape(-1, WINDOW).std(axis=1)
         for d in (np.diff(v), np.diff(v, 2))
     )
     quiet = np.percentile(two, QUIET)
-    # sines and small multisines were played
+    # sines and small multisines are no white noise
     near = (two <= quiet) & (two > 0.5 * quiet)
     if not near.any() or np.median(two[near] / one[: two.size][near]) <= WHITE:
         return 0.0
-    # a dither that was played has power where it was played alone
+    # a dither of a program lacks power at low frequencies
     rows = np.diff(v, 2)[: two.size * WINDOW].reshape(-1, WINDOW)[near] * np.hanning(WINDOW)
     power = np.sum(np.abs(np.fft.rfft(rows)) ** 2, axis=0)
     is_white = power[: WINDOW // 5].sum() > LOW * power.sum()
@@ -93,10 +93,10 @@ def _quieted(piece: Piece, width: float) -> Piece:
 
 
 def _quiet(v: Array, width: float) -> Array:
-    """Return a voltage [V] without noise of some width, or as it is where it moves by more."""
+    """Return a voltage [V] without noise of some width; a moving voltage stays."""
     still = _played(v, width)
     reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
-    # it stands half a width behind: the mean of that is put back, and its noise taken out again
+    # the play lags by half a width: its mean lag is put back, without the noise of the mean
     near = still + uniform_filter1d(v - still, BACK)
     return np.where(reach > MOVES * width, v, _played(near, width / np.sqrt(BACK)))
 

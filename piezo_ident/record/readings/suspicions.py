@@ -4,8 +4,8 @@
 """
 Doubts about a record whose readings are all used.
 
-A stage that was never driven, or that comes from a lower voltage, rises along a curve of its own,
-and does not come back to its first position.
+The first rise of a stage after a rest, or from a lower voltage, has a curve of its own.  The stage
+then does not come back to its first position.
 """
 
 from __future__ import annotations
@@ -18,22 +18,20 @@ from piezo_ident.common.arrays import true_runs
 from piezo_ident.record.readings.faults import constant, end_of_rest, MOVED, period_of
 from piezo_ident.record.record import KINDS, Piece, Record
 
-#: share of the voltage's range within which it rests where it began
+#: two rests lie within this share of the voltage's range
 NEAR = 0.005
-#: seconds and samples of a rest, at least
+#: least seconds and samples of a rest
 REST, REST_SAMPLES = 0.05, 10
 #: share of its range that the voltage goes between the two rests
 AWAY = 0.5
-#: share of the stroke by which the later rests lie beyond the first; creep leaves 0.005 to 0.02
+#: the later rests lie beyond the first by this share of the stroke; creep leaves 0.005 to 0.02
 BEYOND = 0.03
 
 
 def rises_first(piece: Piece) -> bool:
     """
-    Return whether a piece begins with a first rise, as its rests at one voltage tell.
+    Return whether a piece begins with a first rise, by its rests at one voltage.
 
-    Examples
-    --------
     >>> v = np.repeat([0.0, 100.0, 0.0], 1000)
     >>> y = np.repeat([0.0, 80e-6, 6e-6], 1000)
     >>> rises_first(Piece(v, y, 10e3)), rises_first(Piece(v, 8e-7 * v, 10e3))
@@ -47,7 +45,7 @@ def rises_first(piece: Piece) -> bool:
         return False
     first = float(np.mean(y[: rests[0][1]]))
     away = np.flatnonzero(np.abs(v - v[0]) > AWAY * span)
-    # of a later rest its end, when most of the creep has gone
+    # most of the creep is gone at the end of a later rest
     later = [float(np.mean(y[b - least // 2 : b])) for a, b in rests if a > away[:1].sum()]
     if not away.size or not later:
         return False
@@ -81,34 +79,29 @@ def misspelt(labels: Sequence[str]) -> list[str]:
 
 
 def suspicions(record: Record) -> list[str]:
-    """Return what a record makes one suspect: a first rise, a sensor at its stop, and the like."""
-    return [*_first_rise(record), *_stopped(record), *_slow(record)]
-
-
-def _first_rise(record: Record) -> list[str]:
-    if not any(rises_first(piece) for piece in record):
-        return []
-    return [
-        f'{record.name}: the stage does not come back to where it began at '
-        f'{record.pieces[0].v[0]:g} V: it was not driven before, came from beyond that voltage, '
-        'or its zero moves. The memory at the start is fitted; a model that runs by itself '
-        'begins as a stage that came back. Drive it once over the range, and then record'
-    ]
-
-
-def _slow(record: Record) -> list[str]:
+    """Return a text for each doubt: a first rise, a sensor at its stop, a slow sensor."""
+    texts = []
+    if any(rises_first(piece) for piece in record):
+        texts.append(
+            f'{record.name}: the stage does not come back to its first position at '
+            f'{record.pieces[0].v[0]:g} V. It was not driven before, came from beyond that '
+            'voltage, or its zero moves. The memory at the start is fitted; a model that runs by '
+            'itself begins as a stage that came back. Drive it once over the range, then record'
+        )
+    texts += _stopped(record)
     periods = [(period_of(piece.y), period_of(piece.v)) for piece in record]
     m = max((y for y, v in periods if v < y), default=1)
-    if m == 1:
-        return []
-    return [
-        f'{record.name}: one reading of the displacement stands in {m} samples each: its sensor '
-        'is slower than the voltage, and hides the delay and the fast motion of the stage. '
-        f'Record both at one rate, or keep one row in {m}, that with the new reading'
-    ]
+    if m > 1:
+        texts.append(
+            f'{record.name}: one reading of the displacement stands in {m} samples each: its '
+            'sensor is slower than the voltage, and hides the delay and the fast motion of the '
+            f'stage. Record both at one rate, or keep one row in {m}, that with the new reading'
+        )
+    return texts
 
 
 def _stopped(record: Record) -> list[str]:
+    """Return a doubt about a displacement that stays while the voltage moves."""
     span = float(np.ptp(record.voltage_range))
     levels: list[float] = []
     stuck = noisy = 0

@@ -4,8 +4,8 @@
 """
 Records in files of named arrays: npz, MATLAB, HDF5, TDMS and Parquet, each by its library.
 
-A file whose arrays are called ``t``, ``v`` and ``y`` is read as it is.  In any other, all columns
-of numbers are looked at, and `piezo_ident.record.tables.columns` tells which is which.
+A file whose arrays are called ``t``, ``v`` and ``y`` is read as it is.  In any other file,
+`piezo_ident.record.tables.columns` chooses among all columns of numbers.
 """
 
 from __future__ import annotations
@@ -79,15 +79,19 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
         for key, value in node.attrs.items():
             if np.ndim(value) == 0 and isinstance(value, (int, float, np.number)):
                 arrays[f'{name}.{key}'] = np.array([value])  # a sampling rate, perhaps
-        # what MATLAB's cells refer to, and texts as it stores them
+        # MATLAB's cells refer to groups whose names begin with #
         if not isinstance(node, h5py.Dataset) or name.startswith('#'):
             return
         key, kind = name.replace('/', '.'), node.attrs.get('MATLAB_class', b'')
         units = [np.ravel(x) for k, x in node.attrs.items() if k.lower() in ('unit', 'units')]
         unit = units[0][0] if units and units[0].size else ''
         text = unit.decode(errors='replace') if isinstance(unit, bytes) else unit
-        if key == 'segment_name':
-            arrays[key] = _texts(node, kind)
+        if key == 'segment_name' and kind == b'cell':
+            cells = (node.file[r][()].ravel() for r in node[()].ravel())
+            arrays[key] = np.array([''.join(map(chr, cell)) for cell in cells])
+        elif key == 'segment_name':
+            texts = np.ravel(node[()])
+            arrays[key] = np.array([x.decode() if isinstance(x, bytes) else str(x) for x in texts])
         elif kind != b'char' and (node.dtype.kind in 'biuf' or node.dtype.names):
             size += node.nbytes
             _check_size(size)
@@ -95,19 +99,11 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
             parts = {key: node[()]} if key in _LABELS else dict(flat(key, node[()]))
             arrays.update({name + end: x for name, x in parts.items()})
 
-    with (
-        _damage(path, 'HDF5 file', 'save it again; MATLAB: save -v7'),
-        h5py.File(path, 'r') as file,
-    ):
+    cure = 'save it again; MATLAB: save -v7'
+    with _damage(path, 'HDF5 file', cure), h5py.File(path, 'r') as file:
         visit('', file)
         file.visititems(visit)
     return _table(arrays, arrays, path, options)
-
-
-def _texts(node: Any, kind: bytes) -> Any:
-    if kind == b'cell':
-        return np.array([''.join(map(chr, node.file[r][()].ravel())) for r in node[()].ravel()])
-    return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in np.ravel(node[()])])
 
 
 def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
@@ -122,8 +118,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
         _check_size(8 * sum(map(len, channels)))
         for channel in channels:
             name = channel.name
-            if counts[name] > 1:
-                name = f'{channel.group_name}.{name}'
+            name = f'{channel.group_name}.{name}' if counts[name] > 1 else name
             unit = str(channel.properties.get('unit_string', ''))
             name = f'{name} [{unit}]' if unit else name
             paths.append((f'{channel.group_name}/{channel.name}', name))
@@ -131,10 +126,9 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
             if 'wf_increment' in channel.properties:
                 periods[name] = float(channel.properties['wf_increment'])
         cut = getattr(file.file_status, 'channel_statuses', None) or {}
-    # where all end at one sample, nothing but the end is missing
+    # of channels that end at one sample, nothing but the end is missing
     uneven = len({len(channel) for channel in channels}) > 1
     for name, part in cut.items():
-        # a channel without samples would seem to be absent
         if uneven and part.read_length < part.expected_length:
             raise DataError(
                 f'{path}: ends early, {name} has {part.read_length} of {part.expected_length} '
@@ -149,20 +143,15 @@ def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
     with _damage(path, 'Parquet file', 'write it again'), parquet.ParquetFile(path) as file:
         _check_size(8 * file.metadata.num_rows * file.metadata.num_columns)
         table = file.read()
-        arrays = {
-            name: column.to_numpy()
-            for name, column in zip(table.column_names, table.columns, strict=True)
-        }
+        columns = zip(table.column_names, table.columns, strict=True)
+        arrays = {name: column.to_numpy() for name, column in columns}
     return _table(arrays, arrays, path, options)
-
-
-# --- what they share ------------------------------------------------------------------------
 
 
 def _renamed(
     options: ReadOptions, paths: Iterable[tuple[str, str]], names: Container[str]
 ) -> ReadOptions:
-    """Return options that call columns by their names, where they call them by their paths."""
+    """Return options whose columns have their names in place of their paths."""
     known: dict[tuple[str, ...], set[str]] = {}
     for place, name in paths:
         known.setdefault(words_of(place), set()).add(name)
@@ -175,7 +164,7 @@ def _renamed(
 
 
 def library(module: str, path: Path, package: str = '') -> Any:
-    """Import what reads a kind of file; DataError with the command that installs it."""
+    """Import the reader of a kind of file; DataError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -198,10 +187,14 @@ def _table(
     options: ReadOptions,
     periods: Mapping[str, float] = MappingProxyType({}),
 ) -> RecordTable:
-    """Choose the columns among some arrays, and check them; `periods` are their own [s]."""
+    """Choose the columns among some arrays, and check them; `periods` of columns are in s."""
     numbers = {k: np.asarray(x) for k, x in arrays.items() if k not in _LABELS}
     own = numbers.keys() >= {*options.needed}
-    candidates = [k for k, x in numbers.items() if own or _may_be_column(k, x)]
+    candidates = [
+        name
+        for name, x in numbers.items()
+        if own or (x.ndim == 1 and x.size > 1 and (x.dtype.kind in 'biufM' or name == 'segment'))
+    ]
     scalars = {
         k: float(x.ravel()[0]) for k, x in numbers.items() if x.size == 1 and x.dtype.kind in 'iuf'
     }
@@ -220,10 +213,7 @@ def _table(
             raise DataError(f'{path}: v and y are sampled every {text}; {_SLOWER}')
         found, table = chosen(steps)
     places = {role: candidates[place] for role, place in found.items()}
-    columns = {}
-    for role, name in places.items():
-        if role != 'segment':
-            columns[role] = _column(name, numbers[name], path)
+    columns = {r: _column(k, numbers[k], path) for r, k in places.items() if r != 'segment'}
     lengths = {places[role]: x.size for role, x in columns.items()}
     if len(set(lengths.values())) > 1:
         text = ', '.join(f'{k} {n}' for k, n in lengths.items())
@@ -237,10 +227,6 @@ def _table(
     used = {*places.values(), *_LABELS, *scalars}
     ignored = tuple(k for k in everything if k not in used)
     return replace(table, columns=columns, names=names, starts=starts, ignored=ignored)
-
-
-def _may_be_column(name: str, x: Any) -> bool:
-    return x.ndim == 1 and x.size > 1 and (x.dtype.kind in 'biufM' or name == 'segment')
 
 
 def _column(name: str, x: Any, path: Path) -> Any:
@@ -269,7 +255,7 @@ def _segments(arrays: Mapping[str, Any], path: Path) -> tuple[list[str], Any]:
 
 @contextmanager
 def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
-    """Turn whatever a parser throws at damaged bytes into one line."""
+    """Turn any error of a parser over damaged bytes into one line."""
     try:
         yield
     except DataError:

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which column of a file is which.
+The quantity of each column of a file.
 
-The names ``t``, ``v``, ``y``, ``segment``, ``x_<name>``, and ``v_<name>`` and ``y_<name>`` beside
-``v`` and ``y``, mean what they say.  For other names the words and the unit of a header decide,
-and only where one column fits; what was decided is reported.  Where none or several fit, the
-option that decides is asked for.
+The names ``t``, ``v``, ``y``, ``segment``, ``x_<name>``, ``v_<name>`` and ``y_<name>`` say the
+quantity.  Otherwise the words and the unit of a header decide, if one column alone fits; a fault
+reports the choice.  If no column or several columns fit, the error names the option that decides.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ _WORDS = {
     'y': 'y displacement disp position pos weg auslenkung verschiebung deflection elongation '
     'stroke sensor gauge feedback measured',
 }
-#: letters of the name of a number beside the columns: the sampling rate, or its inverse
+#: names, letters only, of the sampling rate or the sampling period beside the columns
 _RATES = r'fs|rate|(sampl(e|ing)|scan)(rate|frequency)|samplesper(s|sec|second)'
 _PERIODS = (
     r'd[tx]|ts|delta[tx]|(sampl(e|ing)|scan)(time|interval|period)|(wf|t|x|time)?incr?(ement)?|'
     r'timestep|hresolution'
 )
-#: of numbers that are likely one of the two, but not surely
+#: names of numbers that are likely one of the two
 _LIKELY = (
     '.*(sampl|scan|acqui|record).*(rate|freq|clock).*',
     'sampling|interval|.*(sampl|scan|acqui|record|time).*(interval|incr|period|step|resol).*',
@@ -50,23 +49,10 @@ _HERTZ = re.compile(r'(|k|M|G)(Hz|Sa?/s)', re.IGNORECASE)
 @dataclass(frozen=True, eq=False)
 class RecordTable:
     """
-    Raw columns of a file.
+    Raw columns of a file, shape (n,), by quantity; without ``t`` if the `rate` [Hz] is known.
 
-    Attributes
-    ----------
-    columns : dict of str to array, shape (n,)
-        By quantity: ``v``, ``y``, ``v_<name>``, ``y_<name>``, ``x_<name>``, and ``t`` unless
-        `rate` is known.
-    names, starts : list of str, array_like
-        Label of each stretch and the row at which it begins.
-    ignored : tuple of str
-        Columns that are not read.
-    units : mapping of str to str
-        Units of ``t``, ``v``, ``y``, and of further axes where the file or an option names them.
-    rate : float, optional
-        Samples a second, of a file without time.
-    faults : tuple of Fault
-        What was guessed.
+    `names` and `starts` are the label and the first row of each stretch, `ignored` the columns
+    that are not read, `units` those that the file or an option names.  `faults` report guesses.
     """
 
     columns: dict[str, Array]
@@ -96,9 +82,8 @@ def choose(
     Return the place of each quantity among the columns, and a table that lacks the columns.
 
     The names stand as in the file, some of them perhaps empty or twice.  A sampling rate may be
-    among the `scalars`, numbers beside the columns; `empty` are places of columns that hold
-    nothing.  DataError when a quantity is missing or ambiguous; the message names the option, and
-    the `path` of the file.
+    among the `scalars`, numbers beside the columns; `empty` are the places of empty columns.
+    DataError for a missing or ambiguous quantity; the message names the option and the file.
     """
     given = {role: _place(role, name, names, path) for role, name in options.named.items()}
     for role in given:
@@ -126,9 +111,13 @@ def choose(
     used = set(places.values())
     faults = []
     if guessed or given or (rate is not None and options.rate is None):
-        parts = [_said(role, places[role], names, units[role]) for role in 'tvy' if role in places]
-        if rate is not None:
-            parts.insert(0, f't is k / {rate:.9g} Hz by {origin}')
+        parts = [] if rate is None else [f't is k / {rate:.9g} Hz by {origin}']
+        for role in filter(places.__contains__, 'tvy'):
+            name = (
+                repr(names[places[role]]) if names[places[role]] else f'column {places[role] + 1}'
+            )
+            plain = f'{next(iter(UNITS[role]))} as no unit is named'
+            parts.append(f'{role} is {name} in {units[role] or plain}')
         action = 'guessed; --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
     table = RecordTable(
@@ -144,7 +133,7 @@ def choose(
 def _exact(
     roles: Iterable[str], names: Sequence[str], barred: Collection[int], path: Path
 ) -> dict[str, int]:
-    """Return the places of columns that are called as their quantities."""
+    """Return the places of columns whose names are quantities."""
     places: dict[str, int] = {}
     for role in roles:
         here = [i for i, name in enumerate(names) if name == role and i not in barred]
@@ -166,12 +155,12 @@ def _guessed(
     places: Mapping[str, int],
     path: Path,
 ) -> dict[str, int]:
-    """Return the places of quantities that one free column alone fits by its words and units."""
+    """Return the places of quantities whose words and units fit one free column alone."""
     guessed: dict[str, int] = {}
     for role in roles:
         fitting = _fitting(role, [(i, names[i]) for i in free if i not in guessed.values()])
         if len(fitting) > 1:
-            # of several runs in groups, the one whose columns are named already
+            # of several groups, the group whose columns are named already
             groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
             fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
         if len(fitting) > 1:
@@ -179,7 +168,15 @@ def _guessed(
             bare = [i for i in fitting if name_and_unit(names[i])[0] == role]
             fitting = bare if len(bare) == 1 else fitting
         if len(fitting) > 1:
-            raise _ambiguous(role, [names[i] for i in fitting], fitting, path)
+            found = [names[i] for i in fitting]
+            # numbers tell equal names apart
+            ways = found if len({*found}) == len(found) else [str(i + 1) for i in fitting]
+            first, second = (_option(role, way) for way in ways[:2])
+            raise DataError(
+                f'{path}: {len(found)} columns may be the {_QUANTITIES[role]} ({listed(found)}); '
+                f'say which: {first} or {second}',
+                options=first,
+            )
         guessed |= dict.fromkeys([role][: len(fitting)], *fitting)
     return guessed
 
@@ -187,8 +184,8 @@ def _guessed(
 def _add_channels(
     places: dict[str, int], free: Iterable[int], names: Sequence[str], path: Path
 ) -> None:
-    """Add the columns of further axes, and further channels, to those that are chosen."""
-    # of several runs in groups, that of the first axis
+    """Add the columns of further axes and channels to the places."""
+    # of several groups, the group of the first axis
     group = next((_group(names[places[role]]) for role in 'vy' if role in places), '')
     for i in free:
         base = name_and_unit(names[i])[0]
@@ -203,7 +200,7 @@ def _add_channels(
 
 
 def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
-    """Return the place of a column that is given by name, by name without unit, or by number."""
+    """Return the place of a column by its name, its name without unit, or its number."""
     low = wanted.strip().casefold()
     is_number = wanted.isdecimal() and 1 <= int(wanted) <= len(names)
     words = None if is_number else words_of(wanted) or None
@@ -241,7 +238,7 @@ def _group(name: str) -> str:
 
 def words_of(name: str) -> tuple[str, ...]:
     """
-    Return the words of a name, by which other programs write the path to a column.
+    Return the words of a name: programs write the path to a column in their own ways.
 
     >>> words_of("/'Log'/'Strain gauge'"), words_of('out.signals(2).values')
     (('log', 'strain', 'gauge'), ('out', 'signals', '2', 'values'))
@@ -250,7 +247,7 @@ def words_of(name: str) -> tuple[str, ...]:
 
 
 def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
-    """Return the places of the columns that fit best by their words and units."""
+    """Return the places of columns whose words name a quantity, else whose unit does."""
     by_word, by_unit = [], []
     for i, name in columns:
         base, unit = name_and_unit(name)
@@ -274,7 +271,7 @@ def _rate_of(
 ) -> tuple[float | None, str]:
     """Return the sampling rate among some numbers, and its name."""
     for name, value in scalars.items():
-        # a unit that is none of `UNITS` counts in square brackets
+        # square brackets keep a unit that `UNITS` lacks
         base, unit = name_and_unit(re.sub(r'\((\w[^()]*)\)\s*$', r'[\1]', name))
         base = re.sub(r'[^a-z]', '', base.casefold())
         if not (value > 0 and np.isfinite(value)):
@@ -289,7 +286,7 @@ def _rate_of(
 
 def rate_option(scalars: Mapping[str, float]) -> str:
     """
-    Return an option with a sampling rate: of what is likely one among some numbers, or any.
+    Return an option with a sampling rate: a likely one among some numbers, or an example.
 
     >>> rate_option({'Recording step [ms]': 0.5}), rate_option({'Trigger [V]': 0.5})
     ('--rate 2000', '--rate 20e3')
@@ -301,9 +298,9 @@ def rate_option(scalars: Mapping[str, float]) -> str:
 def _unit_of(
     role: str, places: Mapping[str, int], names: Sequence[str], options: ReadOptions, path: Path
 ) -> str:
-    """Return what one of a column is, by its header and the option; empty where neither says."""
+    """Return the unit of a column by its header and the option; empty without either."""
     first = role_of(role) or role
-    # a unit that the first axis has holds for the others
+    # the unit of the first axis holds for the others
     own = [names[places[r]] for r in (role, first) if r in places]
     name = next((x for x in own if name_and_unit(x)[1]), '')
     unit, given = name_and_unit(name)[1], options.unit(first) or ''
@@ -312,7 +309,7 @@ def _unit_of(
     if not unit or (given and not kind):
         return given
     if number and kind == 'v' and plain != unit:
-        # of one volt, whatever the header counts in
+        # the option counts in volts, whatever the header counts in
         return f'{float(number) / UNITS["v"][unit]:.15g}{plain}'
     if number and (kind == 'v' or not of_volts):
         return given
@@ -325,16 +322,14 @@ def _unit_of(
 def _contradiction(
     role: str, kind: str | None, name: str, unit: str, given: str, path: Path
 ) -> DataError:
-    """Return the error for a header whose unit is none of a quantity, or not the given one."""
+    """Return the error for a unit of a header that contradicts the quantity or the option."""
     option = f'--{_QUANTITIES[role]}-unit'
     common = [*UNITS[role]][-2]
     column = f'{path}: {listed([name])} is to be the {_QUANTITIES[role]}, '
     if kind is None:
         way = f'{option} {common}'
-        return DataError(
-            f'{column}whose unit {unit!r} is unknown; name another column, or its unit: {way}',
-            options=way,
-        )
+        fault = f'whose unit {unit!r} is unknown; name another column, or its unit: {way}'
+        return DataError(f'{column}{fault}', options=way)
     if kind != role:
         one, scale = ('V', f'10{common}/V') if kind == 'v' else (unit, f'10{common}')
         return DataError(
@@ -342,9 +337,10 @@ def _contradiction(
             f'{one} is, as in {option} {scale}'
         )
     _, plain, of_volts = split_unit(given)
-    # of one volt, as many as the header counts in it
-    way = f'{option} {UNITS["v"].get(unit, 1.0):g}{plain}'
-    cure = 'leave the option out' if of_volts else f'leave the option out, or overrule it by {way}'
+    cure = 'leave the option out'
+    if not of_volts:
+        # as many as the header counts in one volt
+        cure += f', or overrule it by {option} {UNITS["v"].get(unit, 1.0):g}{plain}'
     return DataError(f'{column}in {unit} by the header, and {option} says {given}; {cure}')
 
 
@@ -352,28 +348,10 @@ def _option(role: str, name: str) -> str:
     return f'--columns {shlex.quote(f"{role}={name}")}'
 
 
-def _ambiguous(role: str, names: Sequence[str], places: Sequence[int], path: Path) -> DataError:
-    # equal names are told apart by their numbers
-    ways = names if len(set(names)) == len(names) else [str(i + 1) for i in places]
-    first, second = (_option(role, way) for way in ways[:2])
-    return DataError(
-        f'{path}: {len(names)} columns may be the {_QUANTITIES[role]} ({listed(names)}); say '
-        f'which: {first} or {second}',
-        options=first,
-    )
-
-
-def _said(role: str, place: int, names: Sequence[str], unit: str) -> str:
-    """Return which column is which, for people."""
-    name = repr(names[place]) if names[place] else f'column {place + 1}'
-    known = f'in {unit}' if unit else f'in {next(iter(UNITS[role]))} as no unit is named'
-    return f'{role} is {name} {known}'
-
-
 def _missing(
     missing: list[str], names: Sequence[str], free: list[int], rate: str, path: Path
 ) -> DataError:
-    # time, and what is counted, are the example for nothing else
+    # a column of time, or of counts, is no example for another quantity
     likely = ('', *UNITS['v'], *UNITS['y'])
     fit = [i for i in free if 't' in missing or name_and_unit(names[i])[1] in likely] or free
     ways = [names[i] or str(i + 1) for i in fit]

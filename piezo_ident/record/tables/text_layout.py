@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How a text file is laid out: separator, header and first row.
+The layout of a text file: separator, header and first row.
 
-Instruments write anything above their table.  The table begins where rows of numbers begin, and
-its header is the last line above them; a line of units may stand between the two.
+Instruments write anything above their table.  The table begins with the first rows of numbers.
+Its header is the last line above them; a line of units may stand between the two.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import re
 
 from piezo_ident.record.options import plain_unit, UNITS
 
-#: how comments begin, in the field's programs
+#: first characters of comments in the programs of the field
 COMMENT = ('#', '%', '//', '!')
 
 _DIGITS = r'[-+]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][-+]?\d+)?'
 _NUMBER = re.compile(rf'{_DIGITS}|[-+]?(nan|inf)', re.IGNORECASE | re.ASCII)
-#: a number that stands alone behind its name, with its unit or a cell that may be one
+#: a name and one number behind it, with a unit or a cell that may be a unit
 _ALONE = (
     r'\W*(?P<name>.+?)\s*[:=,;\t]+\s*(?P<value>{})'
     r'(\s*(?P<unit>[^\W\d]+(/s)?)|\s*[,;\t]\s*(?P<cell>[^\W\d]+(/s)?))?(\W.*)?'
 )
 _LVM_UNITS = 'Y_Unit_Label'
-#: in a line of units; Rigol's oscilloscopes name that of counted samples
+#: further cells of a line of units; Rigol's oscilloscopes count samples in Sequence
 _OTHER_UNITS = ('', '-', 'Hz', 'kHz', 'MHz', 'S/s', 'Sa/s', 'N', 'A', 'K', 'Sequence')
 #: None: blanks
 _SEPARATORS = ('\t', ';', ',', None)
@@ -37,10 +37,10 @@ _SEPARATORS = ('\t', ';', ',', None)
 @dataclass(frozen=True)
 class Layout:
     """
-    Separator, names of the columns, and number of lines above the rows.
+    Separator, names of the columns if a line names them, and number of lines above the rows.
 
-    `names` is empty where no line names the columns; `numbers` are those that stand alone behind
-    a name above the table; `empty` are the places of columns that hold nothing in the first rows.
+    `numbers` stand alone behind a name above the table; `empty` are the places of columns without
+    a cell in the first rows.
     """
 
     separator: str | None
@@ -65,12 +65,11 @@ def cells_of(line: str, separator: str | None) -> list[str]:
 
 
 def find_layout(lines: Sequence[str]) -> Layout | None:
-    """Return the layout of the first lines of a file, None where there is no table in them."""
+    """Return the layout of the first lines of a file, None without a table in them."""
     filled = [i for i, line in enumerate(lines) if line.strip()]
-    own = _own(lines, filled)
-    if own is not None:
+    if own := _own(lines, filled):
         return own
-    # one with text in front only where there is no other: LabVIEW lists the properties of channels
+    # a table with text in front comes last: LabVIEW lists the properties of channels
     for is_table in (_is_table, _is_table_behind_text):
         for k, i in enumerate(filled):
             following = [lines[j] for j in filled[k : k + 3]]
@@ -82,7 +81,7 @@ def find_layout(lines: Sequence[str]) -> Layout | None:
 
 
 def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
-    """Return the layout of a file whose first line, but for comments, names t, v or y."""
+    """Return the layout of a file whose first line below comments names t, v or y."""
     first = next((i for i in filled if not lines[i].lstrip().startswith(COMMENT)), None)
     if first is None:
         return None
@@ -101,7 +100,7 @@ def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
     """Return whether rows, one behind the other, are the first of a table of numbers."""
     if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
         return False  # decimal commas between blanks
-    # a spoiled second row is met later; LabVIEW leaves time empty that it does not know
+    # the reader meets a spoiled second row; LabVIEW leaves unknown times empty
     return all(
         sum(map(is_number, row)) > 1 and (not row[0] or is_number(row[0])) for row in rows[:2]
     )
@@ -140,13 +139,13 @@ def _above(
         # LabVIEW lists the units of its columns far above them
         rows = [cells_of(lines[i], separator) for i in filled if lines[i].startswith(_LVM_UNITS)]
         units = ['', *rows[-1][1:]] if rows else []
-    # a column that is empty, as LabVIEW writes time that it does not know; not a cell that is
+    # LabVIEW leaves a column of unknown times empty; one empty cell is none
     some = [cells_of(line, separator) for line in lines[first : first + 100]]
     width = max(len(row), len(names))
     empty = {j for j in range(width) if not any(''.join(cells[j : j + 1]) for cells in some)}
     numbers = dict(filter(None, (_alone(lines[i], separator) for i in filled)))
     for j, (name, unit) in enumerate(zip(names, [*units, *[''] * len(names)], strict=False)):
-        # what oscilloscopes write once, above no column: Increment over 1e-3, or tInc = 1e-3
+        # oscilloscopes write numbers above no column: Increment over 1e-3, or tInc = 1e-3
         found = _alone(f'{name}={unit}' if is_number(unit) else name, separator)
         if found and j in empty:
             numbers |= [found]
@@ -158,7 +157,7 @@ def _above(
 
 
 def _as_wide(names: list[str], row: Sequence[str]) -> list[str]:
-    """Return names without empty ones that no cell of a row has, or with some for empty cells."""
+    """Return as many names as a row has cells: without empty names, or with empty cells."""
     while len(names) > len(row) and not names[-1]:
         names = names[:-1]
     more = row[len(names) :]
@@ -166,7 +165,7 @@ def _as_wide(names: list[str], row: Sequence[str]) -> list[str]:
 
 
 def _alone(line: str, separator: str | None) -> tuple[str, float] | None:
-    """Return the name, with its unit, and the number that stands alone in a line."""
+    """Return the name, with its unit, of the only number in a line, and the number."""
     digits = _DIGITS.replace('[.,]', '[.]') if separator == ',' else _DIGITS
     found = re.fullmatch(_ALONE.format(digits), line.strip().replace('"', ''))
     if not found:
@@ -177,12 +176,12 @@ def _alone(line: str, separator: str | None) -> tuple[str, float] | None:
 
 
 def _named(line: str, separator: str | None, need: int) -> list[str]:
-    """Return the cells of a header, nothing where a line has too few of them to be one."""
+    """Return the cells of a header, nothing for a line with too few cells."""
     cells = cells_of(line, separator)
     # decimal commas make more of a row
     if separator and len(cells) >= (2 if separator == ',' else need):
         return cells
-    # a header may be separated otherwise than its rows
+    # a header and its rows may have different separators
     others = [cells_of(line, other) for other in ('\t', ';', ',')]
     others += [re.split(way, line.strip()) for way in (r'\s{2,}', r'\s+(?![\[(])')]
     return next((x for x in others if len(x) == need), [])

@@ -28,9 +28,9 @@ from piezo_ident.record.tables.columns import choose, rate_option, RecordTable
 from piezo_ident.record.tables.text_layout import COMMENT, find_layout, is_number, Layout
 from piezo_ident.record.tables.write import Blocks, ROWS
 
-#: lines in which the table begins
+#: the table begins within so many lines
 HEAD = 1000
-#: what programs write where there is no number, in lower case
+#: cells of programs that stand for no number, in lower case
 MISSING = ('', 'na', 'n/a', '#na', '#n/a')
 #: a date, which may be absent, the time of day, its decimals, and a zone
 _STAMP = re.compile(
@@ -39,10 +39,6 @@ _STAMP = re.compile(
     re.ASCII,
 )
 _DAY = 86_400 * 10**9
-_POINTS = (
-    'these look like decimal commas: save it with decimal points, or with semicolons between '
-    'the columns'
-)
 
 
 def read_text(path: Path, options: ReadOptions) -> RecordTable:
@@ -65,14 +61,9 @@ def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTabl
     head = list(itertools.islice(lines, HEAD))
     layout = find_layout(head)
     if layout is None:
-        if not any(x.strip() and not x.lstrip().startswith(COMMENT) for x in head):
-            raise DataError(
-                f'{path}: empty file; write a header line t,v,y and the samples below it'
-            )
-        raise DataError(
-            f'{path}: no rows of numbers in the first {len(head)} lines; save it as a table with '
-            'a header line t,v,y'
-        )
+        filled = any(x.strip() and not x.lstrip().startswith(COMMENT) for x in head)
+        fault = f'no rows of numbers in the first {len(head)} lines' if filled else 'empty file'
+        raise DataError(f'{path}: {fault}; save it as a table with a header line t,v,y')
     names = layout.names
     if not names and not options.columns:
         rate = rate_option(layout.numbers)
@@ -113,14 +104,14 @@ def _rows(
     names: list[str] = []
     starts: list[int] = []
     n, line = 0, layout.above
-    # the slow ways last: cells without a number, decimal commas, comments between the rows
+    # slow ways come last: cells without a number, decimal commas, comments between the rows
     ways: list[Any] = [None, *(dict.fromkeys(number, way) for way in (_with_point, _with_comma))]
     if 't' in wanted:
         stamp = _Stamps()
         ways += [way | {wanted['t']: stamp} for way in ways[1:]]
     held: list[str] = []
     while chunk := _whole_rows(lines):
-        # rows of empty cells below the last one are none
+        # rows of empty cells below the last row are no rows
         chunk = held + chunk
         end = len(chunk)
         while end and not chunk[end - 1].strip(f' \t\r\n{layout.separator or ""}'):
@@ -167,7 +158,7 @@ def _with_comma(text: str) -> float:
 
 
 class _Stamps:
-    """Seconds from the first one of ISO 8601 stamps, of which a column may hold the time alone."""
+    """Seconds from the first of ISO 8601 stamps; a stamp may lack its date."""
 
     def __init__(self) -> None:
         self._first: int | None = None
@@ -196,7 +187,7 @@ def _second(day: str, clock: str) -> int:
 
 
 def _whole_rows(lines: Iterator[str]) -> list[str]:
-    """Return the next lines, up to the end of a quoted cell; csv.Error where that never comes."""
+    """Return the next lines, up to the end of a quoted cell; csv.Error without that end."""
     chunk = list(itertools.islice(lines, ROWS))
 
     def further() -> Iterator[str]:
@@ -204,7 +195,7 @@ def _whole_rows(lines: Iterator[str]) -> list[str]:
             chunk.append(line)
             yield line
 
-    # numpy takes all up to the end for a cell whose quote is missing
+    # numpy takes the rest of a file for a cell without its closing quote
     if any('"' in line for line in chunk):
         n = len(chunk)
         reader = csv.reader(itertools.chain(chunk[:], further()), strict=True)
@@ -225,27 +216,24 @@ def _culprit(
     for number, row in enumerate(rows, line):
         at = f'{path}: line {line + reader.line_num - 1 if reader else number}'
         if len(row) <= max(wanted.values()) or (separator == ',' and len(row) != width):
-            return DataError(
-                f'{at} has {len(row)} columns, the header has {width}; '
-                + (_POINTS if _torn_at_commas(row, width, wanted) else 'mend or delete the line')
-            )
+            # decimal commas may have been taken for separators
+            whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
+            torn = width < len(row) <= 2 * width and len(row) - whole <= width - len(wanted)
+            cure = 'save it with decimal points, or with semicolons between the columns'
+            cure = f'these look like decimal commas: {cure}' if torn else 'mend or delete the line'
+            return DataError(f'{at} has {len(row)} columns, the header has {width}; {cure}')
         for name, place in wanted.items():
             text = row[place].strip()
             title = layout.names[place] if layout.names else name
-            if text.lower() in MISSING:
-                continue
-            if name == 't' and _STAMP.fullmatch(text):
+            if text.lower() in MISSING or (name == 't' and _STAMP.fullmatch(text)):
                 continue
             if not is_number(text):
                 below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]
                 if number == layout.above + 1 and below and not any(map(is_number, below)):
                     return _all_text(f'{path}: column {title}', text, name, layout)
-                grouped = re.fullmatch(r'[-+]?\d{1,3}([.,]\d{3})+([.,]\d*)?', text)
-                cure = (
-                    'save it without marks between thousands'
-                    if grouped
-                    else ('mend it, or leave the cell empty where there is no reading')
-                )
+                cure = 'mend it, or leave the cell empty if there is no reading'
+                if re.fullmatch(r'[-+]?\d{1,3}([.,]\d{3})+([.,]\d*)?', text):
+                    cure = 'save it without marks between thousands'
                 return DataError(f'{at}, column {title}: {text[:40]!r} is no number; {cure}')
             marks |= {*text} & {',', '.'}
             if len(marks) > 1:
@@ -265,17 +253,13 @@ def _all_text(column: str, text: str, name: str, layout: Layout) -> DataError:
     )
 
 
-def _torn_at_commas(row: list[str], width: int, wanted: dict[str, int]) -> bool:
-    """Return whether a row looks as if its decimal commas were taken for separators."""
-    whole = sum(re.fullmatch(r'\s*[-+]?\d+([eE][-+]?\d+)?\s*', c) is not None for c in row)
-    return width < len(row) <= 2 * width and len(row) - whole <= width - len(wanted)
-
-
 def write_csv(
     file: BinaryIO, blocks: Blocks, names: Sequence[str] = (), starts: Sequence[int] = ()
 ) -> None:
     """Write a CSV file whose numbers read back exactly."""
-    labels, n = [_quoted(name) for name in names], 0
+    quoted = io.StringIO()
+    csv.writer(quoted, lineterminator='\0').writerows([name, ''] for name in names)
+    labels, n = [line[:-1] for line in quoted.getvalue().split('\0')[:-1]], 0
     for block in blocks():
         if not n:
             file.write((','.join([*block, *(['segment'] if labels else [])]) + '\n').encode())
@@ -285,9 +269,3 @@ def write_csv(
             texts.append(labels[j] for j in np.searchsorted(starts, rows, 'right') - 1)
         file.write(('\n'.join(map(','.join, zip(*texts, strict=True))) + '\n').encode())
         n += rows.size
-
-
-def _quoted(text: str) -> str:
-    line = io.StringIO()
-    csv.writer(line, lineterminator='').writerow([text, ''])
-    return line.getvalue()[:-1]

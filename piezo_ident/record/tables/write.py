@@ -5,7 +5,7 @@
 Records as columns by name, and the writers of NumPy's npz and MATLAB's mat.
 
 ``v_<name>`` and ``y_<name>`` are further axes, ``x_<name>`` further channels.  npz and mat carry
-``segment_name`` and ``segment_start``, the sample (counted from 0) at which each segment begins.
+``segment_name`` and ``segment_start``, the first sample of each segment, counted from 0.
 """
 
 from __future__ import annotations
@@ -28,45 +28,37 @@ ROWS = 65536
 
 def blocks_of(record: Record, **further: Sequence[Array]) -> Blocks:
     """
-    Return the columns of a record, its pieces below each other, as the writers take them.
+    Return the columns of a record for the writers, its pieces one below the other.
 
-    Further columns, one array a piece, stand in place of the channels.
+    Further columns, one array a piece, replace the channels.
     """
 
     def blocks() -> Iterator[Mapping[str, Array]]:
         for i, piece in enumerate(record):
-            columns = {'v': piece.v, 'y': piece.y}
-            if further:
-                columns |= {name: parts[i] for name, parts in further.items()}
-            else:
-                columns |= {column_of(name): x for name, x in piece.channels.items()}
+            own = {column_of(name): x for name, x in piece.channels.items()}
+            own = {name: parts[i] for name, parts in further.items()} if further else own
             for a in range(0, piece.n, ROWS):
-                cut = slice(a, min(a + ROWS, piece.n))
-                yield {'t': piece.time(cut.start, cut.stop)} | {
-                    name: x[cut] for name, x in columns.items()
-                }
+                columns = {'t': piece.time(a, a + ROWS)}
+                for name, x in {'v': piece.v, 'y': piece.y, **own}.items():
+                    columns[name] = x[a : a + ROWS]
+                yield columns
 
     return blocks
 
 
 def labels_of(record: Record) -> tuple[list[str], list[int]]:
     """Return the label of each stretch and its first row, nothing for unlabelled records."""
-    names: list[str] = []
-    starts: list[int] = []
+    labels: list[tuple[str, int]] = []
     offset = 0
     for piece in record:
         end = offset
         for s in piece.segments:
-            if offset + s.start > end:
-                names.append('')
-                starts.append(end)
-            names.append(s.label)
-            starts.append(offset + s.start)
+            labels += [('', end)] if offset + s.start > end else []
+            labels.append((s.label, offset + s.start))
             end = offset + s.stop
         offset += piece.n
-        if end < offset:
-            names.append('')
-            starts.append(end)
+        labels += [('', end)] if end < offset else []
+    names, starts = [name for name, _ in labels], [start for _, start in labels]
     return (names, starts) if any(names) else ([], [])
 
 
@@ -76,18 +68,17 @@ def write_npz(
     """Write a NumPy archive, one column after the other."""
     size = sum(block['t'].size for block in blocks())
     head = {'descr': '<f8', 'fortran_order': False, 'shape': (size,)}
+    labels = {'segment_name': np.array(names), 'segment_start': np.array(starts)} if names else {}
     with zipfile.ZipFile(file, 'w', allowZip64=True) as archive:
-        for name in next(blocks()):
+        for name in (*next(blocks()), *labels):
             with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
                 to: Any = member  # the stubs know other files only
+                if name in labels:
+                    np.lib.format.write_array(to, labels[name], allow_pickle=False)
+                    continue
                 np.lib.format.write_array_header_1_0(to, head)
                 for block in blocks():
                     member.write(np.ascontiguousarray(block[name], dtype='<f8').data)
-        labels = {'segment_name': np.array(names), 'segment_start': np.array(starts)}
-        for name, x in labels.items() if names else ():
-            with archive.open(f'{name}.npy', 'w', force_zip64=True) as member:
-                to = member
-                np.lib.format.write_array(to, x, allow_pickle=False)
 
 
 def write_mat(
