@@ -94,10 +94,6 @@ def test_an_installed_effect_is_in_the_catalogue_and_in_models(site, tmp_path):
     ]
 
 
-def test_an_installed_effect_is_listed_at_the_prompt(site):
-    assert 'soft_stop  (slot: output)' in run(site, '-m', 'piezo_ident', 'effects')
-
-
 @pytest.mark.parametrize(
     'loaded', [ImportError('no module'), SyntaxError('bad'), dict, len, catalogue()['creep']]
 )

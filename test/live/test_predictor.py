@@ -361,7 +361,7 @@ def test_live_error_is_the_rms_of_the_window():
         assert short.rms == 2.0
 
 
-@pytest.mark.parametrize('size', [2, 7, 100, 4000])
+@pytest.mark.parametrize('size', [7, 100, 4000])
 def test_live_error_leaves_out_what_is_wild(size):
     rng, n = np.random.default_rng(0), 8000
     e, live = rng.normal(1e-7, 1e-8, n), LiveError(1.0)

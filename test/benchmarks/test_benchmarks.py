@@ -14,7 +14,7 @@ import pytest
 import run_all
 from side_by_side import seconds, take_turns, Turn
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / 'benchmarks'
 
 

@@ -10,7 +10,7 @@ import build
 import pytest
 from rows import KEYS
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FILES = sorted(build.ROWS.glob('*.json'))
 
 
