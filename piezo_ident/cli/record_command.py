@@ -102,9 +102,16 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
         warnings = stage.model.extrapolation(record)
     for warning in warnings:
         console.say(f'warning: {warning}')
-    console.result(
-        {**data, 'seed': seed, 'out': str(out), **data_of(record, losses), 'warnings': warnings}
-    )
+    if console.as_json:
+        console.result(
+            {
+                **data,
+                'seed': seed,
+                'out': str(out),
+                **data_of(record, losses),
+                'warnings': warnings,
+            }
+        )
 
 
 def _refuse_unused(args: SimpleNamespace) -> None:
@@ -146,7 +153,8 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
         f'{record.duration:.6g} s, {spans([record])}'
     )
     print_faults(record, losses, console)
-    console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
+    if console.as_json:
+        console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
 def _check_record_output(args: SimpleNamespace, *, voltage_only: bool = False) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
-from piezo_ident.report.next_steps import Step
 from piezo_ident.report.table import Table
 
 if TYPE_CHECKING:
@@ -63,6 +62,14 @@ class Link:
 
     href: str
     text: str
+
+
+@dataclass(frozen=True)
+class Step:
+    """Why to do something, and the command that does it."""
+
+    reason: str
+    command: str
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run
 from piezo_ident.record.record import Record
-from piezo_ident.report.to_json import diagnosis_schema
+from piezo_ident.report.json_data import diagnosis_schema
 from programs import SLOW, slow_model
 import pytest
 

@@ -21,6 +21,7 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.html import Step
 from piezo_ident.report.table import listed, number
 from scipy.signal import correlate
 
@@ -63,14 +64,6 @@ class Prompt:
     def command(self, verb: str, *words: str, reads: bool = True) -> str:
         """Return a command line."""
         return shlex.join(['piezo_ident', verb, *words, *(self.reading if reads else ())])
-
-
-@dataclass(frozen=True)
-class Step:
-    """Why to do something, and the command that does it."""
-
-    reason: str
-    command: str
 
 
 def next_steps(
