@@ -56,9 +56,9 @@ def to_json(
     Returns
     -------
     dict
-        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  Numbers that are unknown
-        or infinite are None, with two exceptions: an infinite parameter of an effect is the text
-        ``inf`` or ``-inf``, and the overall error of a model that diverged is the largest float64.
+        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  An unknown or infinite
+        number is None.  Two numbers differ: an infinite parameter of an effect is the text ``inf``
+        or ``-inf``, and the overall error of a diverged model is the largest float64.
     """
     if isinstance(result, EachAxis):
         return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
@@ -330,7 +330,7 @@ def _parameter(parameter: FoundParameter) -> dict[str, Any]:
 
 
 def _value(value: Any) -> Any:
-    # the end of a range that is not there is infinite, which is not the same as unknown
+    # a range without an end has an infinite end, while None means unknown
     if isinstance(value, list):
         return [_value(x) for x in value]
     if isinstance(value, float) and math.isinf(value):

@@ -1,45 +1,20 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How large a residual is over the way since the voltage last turned."""
+"""Find the samples at which the voltage turns."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-import itertools
-
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers, Mask
-from piezo_ident.residual.stretches import block_means
+from piezo_ident.common.arrays import Array, Integers
 
-#: edges of the stretches behind a turn, shares of the voltage range
-EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.01)
 #: a change of direction counts from this share of the range: noise turns all the time
 TURN = 0.01
-#: residuals are means over this time, so that noise does not hide what is looked for [s]
-MEAN = 0.002
-#: fewest means of a way
-FEWEST = 20
-
-
-@dataclass(frozen=True)
-class Way:
-    """
-    Rms of each residual on a stretch of the way behind a turn, from n means over 2 ms.
-
-    The way is a share of the voltage range.
-    """
-
-    start: float
-    stop: float
-    rms: tuple[float, ...]
-    n: int
 
 
 def turns_of(v: Array, least: float) -> Integers:
     """
-    Return the indices at which a voltage turns and then moves by `least` [V] the other way.
+    Find the indices at which a voltage turns and then moves by `least` [V] the other way.
 
     >>> turns_of(np.array([0.0, 5.0, 4.9, 6.0, 1.0, 2.0]), 0.5)
     array([3, 4])
@@ -61,40 +36,3 @@ def turns_of(v: Array, least: float) -> Integers:
                 found.append(low)
             up, high = True, i
     return np.array(found, dtype=np.int64)
-
-
-def _way_since_turn(v: Array, span: float) -> Array:
-    """Return how far v has come since it last turned, share of its span; NaN before a turn."""
-    turns = turns_of(v, TURN * span)
-    way = np.full(v.size, np.nan)
-    if turns.size:
-        last = np.searchsorted(turns, np.arange(v.size), side='right') - 1
-        way = np.where(last >= 0, np.abs(v - v[turns[np.maximum(last, 0)]]) / span, np.nan)
-    return way
-
-
-def ways(
-    pieces: Sequence[tuple[Array, Mask, float]], residuals: Sequence[Sequence[Array]]
-) -> tuple[Way, ...]:
-    """
-    Return the rms of residuals by the way since the last turn; nothing where none is found.
-
-    Each piece is (voltage [V], samples that count, rate [Hz]), and has one or more residuals.
-    """
-    span = max((float(np.ptp(v)) for v, _, _ in pieces), default=0.0)
-    if span == 0.0:
-        return ()
-    found: list[Array] = []
-    for (v, sound, rate), errors in zip(pieces, residuals, strict=True):
-        m = max(1, round(MEAN * rate))
-        keep = sound[: v.size // m * m].reshape(-1, m).all(axis=1)
-        way = _way_since_turn(block_means(v, m), span)
-        found.append(np.stack([way, *(block_means(e, m) for e in errors)])[:, keep])
-    table = np.concatenate(found, axis=1)
-    rows = []
-    for start, stop in itertools.pairwise(EDGES):
-        here = table[1:, (table[0] >= start) & (table[0] < stop)]
-        if here.shape[1] >= FEWEST:
-            rms = tuple(float(x) for x in np.sqrt(np.mean(here**2, axis=1)))
-            rows.append(Way(start, min(stop, 1.0), rms, here.shape[1]))
-    return tuple(rows)
