@@ -133,19 +133,24 @@ def _print(
         for column in SPREAD
     }
     spread = [
-        (_named(column), *(_shown(column, f(x)) for f in (min, statistics.median, max)))
+        (
+            column.replace('_', ' '),
+            _unit(column),
+            *(_shown(column, f(x)) for f in (min, statistics.median, max)),
+        )
         for column, x in numbers.items()
         if x
     ]
     console.say()
-    console.say(plain_text(table('Spread', ('', 'lowest', 'median', 'highest'), spread)))
+    console.say(plain_text(table('Spread', ('', 'unit', 'lowest', 'median', 'highest'), spread)))
     odd = stand_out(rows)
     if odd:
         console.say('\nThese stand out, with the median of all in brackets:')
     values = {row.record: row.values for row in rows}
     for record in list(odd)[:PRINTED]:
         texts = [
-            f'{_named(column)} {_shown(column, values[record][column])} ({_shown(column, median)})'
+            f'{column.replace("_", " ")} {_shown(column, values[record][column])} '
+            f'{_unit(column)} ({_shown(column, median)})'.replace('  ', ' ')
             for column, median in odd[record].items()
         ]
         console.say(f'  {record}: {", ".join(texts)}')
@@ -154,10 +159,9 @@ def _print(
     return odd
 
 
-def _named(column: str) -> str:
-    """Name a column with its unit for people."""
-    unit, _ = UNITS.get(column, (unit_of(column), 1.0))
-    return column.replace('_', ' ') + f' / {unit}' * bool(unit)
+def _unit(column: str) -> str:
+    """Name the unit of a column for people."""
+    return UNITS.get(column, (unit_of(column), 1.0))[0]
 
 
 def _shown(column: str, value: Value) -> str:

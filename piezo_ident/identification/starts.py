@@ -27,14 +27,17 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 Rule = Callable[[Array], Array]
 
-#: number of blocks into which a run is thinned; each keeps its extremes and its last sample
-BLOCKS = 4000
+#: number of blocks into which a run is thinned, to choose a guess and to fit the memory; each
+#: block keeps its extremes and its last sample
+ROUGH, BLOCKS = 500, 2000
 #: number of plays of the temporary H, and of the blocks of a run in the fit (both taste)
 PLAYS, FIT_BLOCKS = 40, 50
+#: number of shares of the memory for each of the `PARTS` of a guess
+FINER = 2
 #: shares of the plays that were pushed down, and up, by the motion before the start
 ENDS = (0.9, 0.1)
 #: iterations from every guess, from the best guesses, and number of the best
-FEW, MANY, BEST = 2, 15, 3
+FEW, MANY, BEST = 3, 15, 1
 #: share by which another guess must err less than the plain guess: a record of steps alone cannot
 #: tell the memory
 CLEARLY = 0.02
@@ -48,19 +51,22 @@ def _guesses() -> Array:
     return np.array([*between, *turned, *back])
 
 
-def _thinned(excerpt: Excerpt, lag: float, i: int) -> Stretch:
-    """Thin a run to its extremes; the displacement is taken `lag` samples later."""
-    u, n = excerpt.u, excerpt.u.size
-    size = max(1, n // BLOCKS)
-    edges = np.arange(0, n - n % size, size)
-    blocks = u[: edges.size * size].reshape(-1, size)
-    last = edges + size - 1
-    keep = np.unique([edges + blocks.argmin(axis=1), edges + blocks.argmax(axis=1), last])
-    at = np.minimum(keep + lag, n - 1)
-    use = np.isin(keep, last) & (keep + lag <= n - 1) & excerpt.use[np.rint(at).astype(int)]
-    x = np.interp(at, np.arange(n), excerpt.x)
-    block = (i + np.arange(keep.size) / keep.size) * FIT_BLOCKS
-    return Stretch(u[keep], x, use, block.astype(int), 1.0, i, i)
+def _thinned(excerpts: Sequence[Excerpt], lag: float, count: int) -> list[Stretch]:
+    """Thin runs to the extremes of `count` blocks, with the displacement `lag` samples later."""
+    stretches = []
+    for i, excerpt in enumerate(excerpts):
+        u, n = excerpt.u, excerpt.u.size
+        size = max(1, n // count)
+        edges = np.arange(0, n - n % size, size)
+        blocks = u[: edges.size * size].reshape(-1, size)
+        last = edges + size - 1
+        keep = np.unique([edges + blocks.argmin(axis=1), edges + blocks.argmax(axis=1), last])
+        at = np.minimum(keep + lag, n - 1)
+        use = np.isin(keep, last) & (keep + lag <= n - 1) & excerpt.use[np.rint(at).astype(int)]
+        x = np.interp(at, np.arange(n), excerpt.x)
+        block = (i + np.arange(keep.size) / keep.size) * FIT_BLOCKS
+        stretches.append(Stretch(u[keep], x, use, block.astype(int), 1.0, i, i))
+    return stretches
 
 
 def fit_starts(
@@ -84,22 +90,29 @@ def fit_starts(
         `Excerpt.memory` of each run.
     """
     rules = [e.memory for e in excerpts]
-    stretches = [_thinned(e, lag, i) for i, e in enumerate(excerpts)]
+    stretches = _thinned(excerpts, lag, BLOCKS)
     sought = [i for i, is_sought in enumerate(unknown) if is_sought and stretches[i].use.any()]
     if not sought:
         return rules
     span = min(float(e.u.min()) for e in excerpts), max(float(e.u.max()) for e in excerpts)
     law = HysteresisLaw('plays', even_thresholds(span[1] - span[0], PLAYS), span)
 
+    rough = _thinned(excerpts, lag, ROUGH)
+    rough = rough if all(s.use.any() for s in rough) else stretches
+
     def begun(shares: Array) -> Fit:
         guesses = np.zeros((len(excerpts), PARTS))
         guesses[sought] = shares
-        start = Stage.linear(law, Dynamics.unit(), 0, guesses)
-        return fit(start, stretches, iterations=FEW)
+        return fit(Stage.linear(law, Dynamics.unit(), 0, guesses), rough, iterations=FEW)
+
+    def fitted(one: Fit) -> Fit:
+        starts, guesses = (np.repeat(x, FINER, 1) for x in (one.stage.starts, one.stage.guesses))
+        finer = replace(one.stage, starts=starts, guesses=guesses)
+        return fit(finer, stretches, iterations=MANY)
 
     plain, *others = map(begun, _guesses())
     best = [plain, *sorted(others, key=lambda one: one.loss)[:BEST]]
-    plain, *others = (fit(one.stage, stretches, iterations=MANY) for one in best)
+    plain, *others = map(fitted, best)
     chosen = min(others, key=lambda one: one.loss)
     stage = (chosen if chosen.loss < (1.0 - CLEARLY) * plain.loss else plain).stage
     for i in sought:
