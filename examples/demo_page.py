@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
 from piezo_ident.report.figures import style
-from piezo_ident.report.html import Link, Page, page_html, Section, Shown
-from piezo_ident.report.next_steps import Step
+from piezo_ident.report.html import Link, Page, page_html, Section, Shown, Step
 from piezo_ident.report.table import number, Table
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 import statistics
 import sys
@@ -19,33 +19,19 @@ from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.results import Settings
 from piezo_ident.many.outliers import stand_out
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
-from piezo_ident.many.table import columns_of, csv_text, Row, unit_of
+from piezo_ident.many.table import columns_of, csv_text, Row, unit_of, Value
 from piezo_ident.model.files import load
+from piezo_ident.report.table import plain_text, table
 
 #: most failed records that are printed
 PRINTED = 10
-#: columns whose spread is printed: name, unit for people, and factor from the unit of the table
-SPREAD = {
-    'error_held_out': ('held-out error', '% of stroke', 1.0),
-    'error_before': ('error before', '% of stroke', 1.0),
-    'error_after': ('error after', '% of stroke', 1.0),
-    'unexplained': ('unexplained', '% of stroke', 1.0),
-    'stroke': ('stroke', 'µm', 1e6),
-    'gain': ('gain', 'µm/V', 1e6),
-    'loop_width': ('loop width', '% of stroke', 1.0),
-    'delay': ('delay', 'ms', 1e3),
-    'bandwidth': ('bandwidth', 'Hz', 1.0),
-    'resonance': ('resonance', 'Hz', 1.0),
-}
-#: further columns in which a record may stand out
-OTHERS = {
-    'sample_rate': ('sampling rate', 'Hz', 1.0),
-    'duration': ('duration', 's', 1.0),
-    'voltage_high': ('highest voltage', 'V', 1.0),
-    'delay_samples': ('delay', 'samples', 1.0),
-    'error_fitted': ('fitted error', '% of stroke', 1.0),
-    'noise_floor': ('noise floor', '% of stroke', 1.0),
-}
+#: columns whose spread is printed
+SPREAD = (
+    *('error_held_out', 'error_before', 'error_after', 'unexplained'),
+    *('stroke', 'gain', 'loop_width', 'delay', 'bandwidth', 'resonance'),
+)
+#: units for people, with the factor from the unit of the table
+UNITS = {'stroke': ('µm', 1e6), 'gain': ('µm/V', 1e6), 'delay': ('ms', 1e3)}
 
 
 def check_each(args: SimpleNamespace) -> None:
@@ -97,12 +83,12 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             scheduler=args.scheduler,
             progress=show,
         )
-    table = folder / 'records.csv'
-    write_text(table, csv_text(rows))
+    place = folder / 'records.csv'
+    write_text(place, csv_text(rows))
     bad = [row for row in rows if not row.is_good]
     if len(bad) == len(rows):
         raise DataError(
-            f'none of {len(rows)} records gave a result, see {table}; the first: '
+            f'none of {len(rows)} records gave a result, see {place}; the first: '
             f'{bad[0].record}: {bad[0].reason}'
         )
     odd = _print(rows, bad, console)
@@ -116,7 +102,7 @@ def _each(args: SimpleNamespace, task: Task, console: Console) -> None:
             'rows': [
                 {'record': row.record, 'reason': row.reason or None, **row.values} for row in rows
             ],
-            'files': {'folder': str(folder), 'table': str(table)},
+            'files': {'folder': str(folder), 'table': str(place)},
         }
     )
 
@@ -142,30 +128,42 @@ def _print(
     ]
     for verdict in sorted(set(verdicts), key=lambda v: -verdicts.count(v)):
         console.say(f'  {verdict}: {verdicts.count(verdict)}')
-    console.say(f'\n{"":30s}{"lowest":>11s}{"median":>11s}{"highest":>11s}')
-    for column, (name, unit, factor) in SPREAD.items():
-        values = [x for row in rows if isinstance(x := row.values.get(column), (int, float))]
-        if values:
-            numbers = (factor * f(values) for f in (min, statistics.median, max))
-            cells = ''.join(f'{x:11.4g}' for x in numbers)
-            console.say(f'{f"{name} / {unit}":30s}{cells}')
+    numbers = {
+        column: [x for row in rows if isinstance(x := row.values.get(column), (int, float))]
+        for column in SPREAD
+    }
+    spread = [
+        (
+            column.replace('_', ' '),
+            _unit(column),
+            *(_shown(column, f(x)) for f in (min, statistics.median, max)),
+        )
+        for column, x in numbers.items()
+        if x
+    ]
+    console.say()
+    console.say(plain_text(table('Spread', ('', 'unit', 'lowest', 'median', 'highest'), spread)))
     odd = stand_out(rows)
-    _print_odd(rows, odd, console)
+    if odd:
+        console.say('\nThese stand out, with the median of all in brackets:')
+    values = {row.record: row.values for row in rows}
+    for record in list(odd)[:PRINTED]:
+        texts = [
+            f'{column.replace("_", " ")} {_shown(column, values[record][column])} '
+            f'{_unit(column)} ({_shown(column, median)})'.replace('  ', ' ')
+            for column, median in odd[record].items()
+        ]
+        console.say(f'  {record}: {", ".join(texts)}')
+    if len(odd) > PRINTED:
+        console.say(f'  and {len(odd) - PRINTED} more')
     return odd
 
 
-def _print_odd(
-    rows: Sequence[Row], odd: Mapping[str, Mapping[str, float]], console: Console
-) -> None:
-    of, columns = {row.record: row for row in rows}, {**SPREAD, **OTHERS}
-    if odd:
-        console.say('\nThese stand out, with the median of all in brackets:')
-    for record in list(odd)[:PRINTED]:
-        told = []
-        for column, median in odd[record].items():
-            name, unit, factor = columns[column]
-            here = factor * float(of[record].values[column] or 0.0)
-            told.append(f'{name} {here:.4g} {unit} ({factor * median:.4g})')
-        console.say(f'  {record}: {", ".join(told)}')
-    if len(odd) > PRINTED:
-        console.say(f'  and {len(odd) - PRINTED} more')
+def _unit(column: str) -> str:
+    """Name the unit of a column for people."""
+    return UNITS.get(column, (unit_of(column), 1.0))[0]
+
+
+def _shown(column: str, value: Value) -> str:
+    """Write a number in the unit for people."""
+    return f'{UNITS.get(column, ("", 1.0))[1] * float(value or 0.0):.4g}'

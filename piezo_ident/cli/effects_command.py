@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 import difflib
 import inspect
-import textwrap
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,9 +15,7 @@ import numpy as np
 from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.effects import catalogue, Effect, Parameter
-
-#: width of the text [characters]
-WIDTH = 99
+from piezo_ident.report.table import plain_text, Table
 
 
 def effect_name(text: str) -> str:
@@ -40,8 +37,7 @@ def effects_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident effects``."""
     if args.name is not None:
         effect = catalogue()[effect_name(args.name)]
-        for line in _at_length(effect):
-            console.say(line)
+        console.say(f'{_at_length(effect)}\n\n{_documentation(effect)}')
         console.result(_data(effect))
         return
     effects = [effect for _, effect in sorted(catalogue().items())]
@@ -69,25 +65,26 @@ def _documentation(effect: type[Effect]) -> str:
     return inspect.cleandoc(effect.__doc__ or '')
 
 
-def _at_length(effect: type[Effect]) -> list[str]:
-    lines = [_title(effect), *textwrap.wrap(_about(effect), WIDTH)]
-    if effect.needs:
-        lines += textwrap.wrap(f'shows in: {effect.needs}', WIDTH, subsequent_indent='  ')
-    if effect.rate_independent:
-        lines.append('follows the path of the voltage alone: a wide enough hysteresis imitates it')
-    if effect.in_dynamics:
-        lines.append('changes the dynamics: named beyond what the model missed at identification')
-    if effect.time_driven:
-        lines.append('driven by time: its amplitudes differ from record to record')
+def _at_length(effect: type[Effect]) -> str:
+    notes = [
+        (effect.rate_independent, 'follows the path of the voltage alone, as hysteresis does'),
+        (
+            effect.in_dynamics,
+            'changes the dynamics: named beyond errors of identification',
+        ),
+        (effect.time_driven, 'driven by time: its amplitudes differ from record to record'),
+    ]
     head = ('parameter', 'unit', 'from', 'to', 'neutral', 'default', '')
-    rows = [head, *(_row(p) for p in effect.parameters)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines.append('')
-    for row in rows:
-        cells = [cell.ljust(w) for cell, w in zip(row, widths, strict=True)]
-        lines.append('  '.join(cells).rstrip())
-    lines += ['', *_documentation(effect).splitlines()]
-    return lines
+    parameters = Table('', head, [_row(p) for p in effect.parameters])
+    return plain_text(
+        [
+            _title(effect),
+            _about(effect),
+            f'shows in: {effect.needs}' if effect.needs else '',
+            *(text for holds, text in notes if holds),
+            parameters,
+        ]
+    )
 
 
 def _row(p: Parameter) -> tuple[str, ...]:
@@ -100,6 +97,7 @@ def _row(p: Parameter) -> tuple[str, ...]:
 
 
 def _data(effect: type[Effect]) -> dict[str, Any]:
+    keys = ('name', 'unit', 'description', 'neutral', 'lower', 'upper', 'default', 'kind')
     return {
         'name': effect.name,
         'slot': effect.slot,
@@ -108,18 +106,7 @@ def _data(effect: type[Effect]) -> dict[str, Any]:
         'time_driven': effect.time_driven,
         'module': effect.__module__,
         'parameters': [
-            {
-                'name': p.name,
-                'unit': p.unit,
-                'description': p.description,
-                'neutral': p.neutral,
-                'lower': p.lower,
-                'upper': p.upper,
-                'default': p.default,
-                'kind': p.kind,
-                'list': p.vector,
-            }
-            for p in effect.parameters
+            {**{key: getattr(p, key) for key in keys}, 'list': p.vector} for p in effect.parameters
         ],
         'documentation': _documentation(effect),
     }

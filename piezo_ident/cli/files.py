@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 import math
 import os
 from pathlib import Path
@@ -196,17 +196,10 @@ def print_faults(record: Record, losses: Sequence[str], console: Console) -> Non
 
 
 def data_of(record: Record, losses: Sequence[str] = ()) -> dict[str, Any]:
-    """Return size and faults of a record, and the losses of its output file, for JSON."""
-    return {
-        'record': record.name,
-        'pieces': len(record.pieces),
-        'samples': record.n,
-        'duration': record.duration,
-        'sample_rates': list(dict.fromkeys(p.sample_rate for p in record)),
-        'labels': list(record.labels),
-        'faults': [asdict(fault) for fault in record.faults],
-        'not_kept': list(losses),
-    }
+    """Return a record, and the losses of its output file, for JSON."""
+    from piezo_ident.report import to_json
+
+    return {**to_json(record), 'not_kept': list(losses)}
 
 
 # --- outputs

@@ -26,7 +26,6 @@ from piezo_ident.cli.files import (
     MODEL_FILES,
     read_all,
 )
-from piezo_ident.cli.model_command import print_run
 from piezo_ident.cli.options import READING
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.identification.results import Identification, Settings
@@ -62,9 +61,9 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
         sines: tuple[SineError, ...] = ()
         if not isinstance(result, EachAxis) and record.find('sine'):
             sines = sine_errors(result.model, record)
-        console.say(f'\n{record.name}, not fitted:')
-        data = print_run(free_run(result.model, record), console)
-        checks.append({**data, 'record': record.name, 'sines': list(map(asdict, sines))})
+        run = free_run(result.model, record)
+        console.say(f'\n{run}')
+        checks.append({**report.to_json(run), 'sines': list(map(asdict, sines))})
         if sines:
             console.say(f'\n{report.table_one(sines)}')
     files = print_files(args, console)

@@ -27,14 +27,14 @@ from piezo_ident.cli.files import (
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
-from piezo_ident.model.free_run import FreeRun, FreeRunErrors
-from piezo_ident.model.metrics import FORMULA
+from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel, voltage_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.tables.write import blocks_of
+from piezo_ident.report import save_plot, to_json
 from piezo_ident.verbs.predict import free_run, predict, prediction_doubts
 
 if TYPE_CHECKING:
@@ -75,8 +75,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     if record.is_measured:
         with naming(str(args.model)):
             run = free_run(model, record)
-        console.say(f'{args.model} on {record.name}, free run:')
-        data |= print_run(run, console)
+        console.say(str(run))
+        data |= to_json(run)
         runs = {**run} if isinstance(run, EachAxis) else {'y': run}
         lost = sum(x.record.n - x.errors.n for x in runs.values())
         if lost and args.out is not None:
@@ -87,8 +87,6 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         for axis, x in runs.items():
             columns[axis] = [piece.measured for piece in x.record]
         if args.plot is not None:
-            from piezo_ident.report import save_plot
-
             with deferred_interrupts():
                 save_plot(run, args.plot)
     else:
@@ -126,64 +124,6 @@ def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], pa
     write_columns(path, known)
 
 
-def print_run(run: FreeRun | EachAxis[FreeRun], console: Console) -> dict[str, Any]:
-    """Print the errors of a free run, for each axis; return them for JSON."""
-    if not isinstance(run, EachAxis):
-        print_errors(run, console)
-        return error_data(run)
-    for axis, x in run.items():
-        console.say(f' axis {axis}:')
-        print_errors(x, console)
-    return {'axes': {axis: error_data(x) for axis, x in run.items()}}
-
-
-def print_errors(run: FreeRun, console: Console) -> None:
-    """Print the errors and warnings of a free run."""
-    rows = [('whole record', run.errors)]
-    if any(run.estimated):
-        if run.errors_after_start is None:
-            console.say('  no sample at which the start is forgotten: drive a wider range')
-        else:
-            rows.append(('start forgotten', run.errors_after_start))
-    for name, e in rows:
-        console.say(
-            f'  {name:16s} {e.percent:8.3g} % of stroke   fit {e.fit:8.3f} %   {e.n} samples'
-        )
-        if e.mostly_offset:
-            from piezo_ident.report import length
-
-            console.say(
-                f'  {"":16s} {e.percent_without_offset:8.3g} % after removing a mean of '
-                f'{length(e.offset)}'
-                + (': the sensor was set to zero elsewhere' if e.only_offset else '')
-            )
-    console.say(f'  % of stroke = {FORMULA}; fit = 100 (1 - |y - y_hat| / |y - mean y|)')
-    for warning in run.warnings:
-        console.say(f'  warning: {warning}')
-
-
-def error_data(run: FreeRun) -> dict[str, Any]:
-    """Return the errors of a free run for JSON."""
-
-    def row(errors: FreeRunErrors) -> dict[str, Any]:
-        return {
-            'percent_of_stroke': errors.percent,
-            'fit_percent': errors.fit,
-            'n': errors.n,
-            'offset': errors.offset,
-            'percent_of_stroke_without_offset': errors.percent_without_offset,
-        }
-
-    late = run.errors_after_start
-    return {
-        'formula': FORMULA,
-        'whole': row(run.errors),
-        'start_forgotten': None if late is None else row(late),
-        'memory_estimated': list(run.estimated),
-        'warnings': list(run.warnings),
-    }
-
-
 def invert_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident invert``."""
     from piezo_ident.verbs.invert import invert
@@ -215,34 +155,17 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
             columns |= voltages
             write_columns(args.out, lambda: iter([columns]))
         if args.plot is not None:
-            from piezo_ident.report import save_plot
-
             save_plot(drive, args.plot)
     print_faults(reference, (), console)
     console.result(
         {
             'model': str(args.model),
             'reference': str(args.record),
-            'formula': FORMULA,
-            **_told(axes['y'], piece.sample_rate),
-            'axes': {k: _told(x, piece.sample_rate) for k, x in axes.items()},
+            **to_json(axes['y']),
+            'axes': {axis: to_json(x) for axis, x in axes.items()},
             **_wrote(args, console),
         }
     )
-
-
-def _told(drive: Inverse, rate: float) -> dict[str, Any]:
-    """Return the figures of an inversion for JSON."""
-    return {
-        'percent_of_stroke': drive.error,
-        'expected_percent_of_stroke': drive.expected,
-        'expected_offset': drive.expected_offset,
-        'lead': drive.lead,
-        'clipped': int(np.count_nonzero(drive.clipped)),
-        'voltage_range': [float(drive.v.min()), float(drive.v.max())],
-        'steepest': float(np.abs(np.diff(drive.v)).max()) * rate,
-        'warnings': list(drive.warnings),
-    }
 
 
 def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:

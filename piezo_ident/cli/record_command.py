@@ -25,10 +25,10 @@ from piezo_ident.common.config import find_config
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.excitation.axes import build_axes
-from piezo_ident.excitation.program import Program
+from piezo_ident.excitation.program import Program, Sequence
 from piezo_ident.excitation.scaled import program_to_yaml, scaled
 from piezo_ident.model.simulated_stage import SimulatedStage
-from piezo_ident.model.two_axis_stage import load_stage
+from piezo_ident.model.two_axis_stage import load_stage, TwoAxisStage
 from piezo_ident.record import io as record_io
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.tables.write import labels_of
@@ -46,12 +46,7 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
         _check_record_output(args, voltage_only=args.voltage_only)
     if is_program or args.voltage_only:
         _refuse_unused(args)
-    files = {}
-    for kind, name in (('stage', args.config), ('program', args.program)):
-        check_link(Path(name))
-        files[kind] = find_config(name, kind)
-        if Path(name).suffix and not Path(name).is_file():
-            console.note(f'{name} is not here; taking the shipped {files[kind]}')
+    files = _files_of(args, console)
     stage, program = load_stage(files['stage']), Program.load(files['program'])
     rate = stage.sample_rate if args.sample_rate is None else args.sample_rate
     is_static = isinstance(stage, SimulatedStage) and stage.model.is_static
@@ -66,45 +61,71 @@ def simulate_command(args: SimpleNamespace, console: Console) -> None:
     if is_program:
         _write_program(out, program, len(stage.axes), console)
         return
-    sequence, *others = build_axes(program, len(stage.axes), rate)
-    rng = np.random.default_rng(seed)
-    if args.voltage_only:
-        channels = {f'v_{axis}': q.v for axis, q in zip(stage.axes[1:], others, strict=True)}
-        unknown = np.full(sequence.n, np.nan)
-        piece = Piece(sequence.v, unknown, rate, segments=sequence.segments, channels=channels)
-        record = Record((piece,), out.name)
-    elif isinstance(stage, SimulatedStage):
-        record = stage.play(sequence, rng, name=out.name)
-    else:
-        record = stage.play((sequence, *others), rng, name=out.name)
-    data = {'stage': str(files['stage']), 'program': str(files['program']), 'seed': str(seed)}
-    is_bag = out.suffix.lower() in ('', '.mcap', '.db3')
-    losses: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    with deferred_interrupts():
-        if args.voltage_only:
-            columns = {'t': piece.t, 'v': piece.v, **piece.channels}
-            # with the labels: a measured column added later makes a labelled record
-            record_io.write_columns(out, lambda: iter([columns]), *labels_of(record))
-        else:
-            losses = record_io.write(
-                record,
-                out,
-                overwrite=args.overwrite,
-                storage=args.storage,
-                custom_data=data if is_bag else None,
-            )
+    sequences = build_axes(program, len(stage.axes), rate)
+    record = _record_of(stage, sequences, None if args.voltage_only else seed, out.name)
+    data = {**{kind: str(file) for kind, file in files.items()}, 'seed': str(seed)}
+    losses = _write_record(args, record, data)
     content = 'the voltage alone' if args.voltage_only else f'seed {seed}'
     console.say(f'{out}: {record.duration:.4g} s at {rate:g} Hz, {record.n} samples, {content}')
-    console.say(sequence.describe())
+    console.say(sequences[0].describe())
     print_faults(record, losses, console)
+    warnings: tuple[str, ...] = ()
     if isinstance(stage, SimulatedStage) and not args.voltage_only:
         warnings = stage.model.extrapolation(record)
     for warning in warnings:
         console.say(f'warning: {warning}')
-    console.result(
-        {**data, 'seed': seed, 'out': str(out), **data_of(record, losses), 'warnings': warnings}
-    )
+    if console.as_json:
+        end = {'out': str(out), **data_of(record, losses), 'warnings': warnings}
+        console.result({**data, 'seed': seed, **end})
+
+
+def _files_of(args: SimpleNamespace, console: Console) -> dict[str, Path]:
+    """Find the files of stage and program; report a shipped file in place of a missing one."""
+    files = {}
+    for kind, name in (('stage', args.config), ('program', args.program)):
+        check_link(Path(name))
+        files[kind] = find_config(name, kind)
+        if Path(name).suffix and not Path(name).is_file():
+            console.note(f'{name} is not here; taking the shipped {files[kind]}')
+    return files
+
+
+def _record_of(
+    stage: SimulatedStage | TwoAxisStage,
+    sequences: tuple[Sequence, ...],
+    seed: int | None,
+    name: str,
+) -> Record:
+    """Play the sequences on the stage, or without a seed make a record of the voltages alone."""
+    if seed is None:
+        first, *others = sequences
+        channels = {f'v_{axis}': q.v for axis, q in zip(stage.axes[1:], others, strict=True)}
+        unknown, rate = np.full(first.n, np.nan), first.sample_rate
+        piece = Piece(first.v, unknown, rate, segments=first.segments, channels=channels)
+        return Record((piece,), name)
+    rng = np.random.default_rng(seed)
+    if isinstance(stage, SimulatedStage):
+        return stage.play(sequences[0], rng, name=name)
+    return stage.play(sequences, rng, name=name)
+
+
+def _write_record(args: SimpleNamespace, record: Record, data: dict[str, str]) -> tuple[str, ...]:
+    """Write a record, or its voltages alone; return the data that the file cannot keep."""
+    is_bag = args.out.suffix.lower() in ('', '.mcap', '.db3')
+    with deferred_interrupts():
+        if not args.voltage_only:
+            return record_io.write(
+                record,
+                args.out,
+                overwrite=args.overwrite,
+                storage=args.storage,
+                custom_data=data if is_bag else None,
+            )
+        (piece,) = record
+        columns = {'t': piece.t, 'v': piece.v, **piece.channels}
+        # with the labels: a measured column added later makes a labelled record
+        record_io.write_columns(args.out, lambda: iter([columns]), *labels_of(record))
+        return ()
 
 
 def _refuse_unused(args: SimpleNamespace) -> None:
@@ -146,7 +167,8 @@ def convert_command(args: SimpleNamespace, console: Console) -> None:
         f'{record.duration:.6g} s, {spans([record])}'
     )
     print_faults(record, losses, console)
-    console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
+    if console.as_json:
+        console.result({'in': str(args.record), 'out': str(args.out), **data_of(record, losses)})
 
 
 def _check_record_output(args: SimpleNamespace, *, voltage_only: bool = False) -> None:

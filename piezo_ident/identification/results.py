@@ -125,8 +125,6 @@ class DelayResult:
         One-step ARX loss for d = 0, 1, ...
     scan : int or None
         Delay of the scan.
-    fraction : float
-        Fraction of a sample in addition to `samples`, if the data show it.
     """
 
     samples: int
@@ -135,7 +133,6 @@ class DelayResult:
     step: StepDelay | None = None
     loss: Array | None = None
     scan: int | None = None
-    fraction: float = 0.0
 
     @property
     def agree(self) -> bool | None:
@@ -147,7 +144,7 @@ class DelayResult:
     @property
     def unknown(self) -> DelayResult:
         """Same steps and scan with a delay of 0, for a model that errs less without a delay."""
-        return replace(self, samples=0, fraction=0.0, std=float('inf'), source='none')
+        return replace(self, samples=0, std=float('inf'), source='none')
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,33 +16,36 @@ Examples
 >>> pi.report.save_plot(result, 'loop.png')
 """
 
-from piezo_ident.report.diagnosis import diagnosis_text
-from piezo_ident.report.folder import check_report_folder, write_report
-from piezo_ident.report.identification import headline, identification_text, table_one
-from piezo_ident.report.next_steps import next_steps, Prompt, Step
-from piezo_ident.report.picture import model_text, plot, save_plot, to_html, to_text
-from piezo_ident.report.refined import validated
-from piezo_ident.report.table import length
-from piezo_ident.report.to_json import json_text, steps_to_json, to_json
+import importlib
+from typing import Any, TYPE_CHECKING
 
-__all__ = [
-    'Prompt',
-    'Step',
-    'check_report_folder',
-    'diagnosis_text',
-    'headline',
-    'identification_text',
-    'json_text',
-    'length',
-    'model_text',
-    'next_steps',
-    'plot',
-    'save_plot',
-    'steps_to_json',
-    'table_one',
-    'to_html',
-    'to_json',
-    'to_text',
-    'validated',
-    'write_report',
-]
+if TYPE_CHECKING:
+    from piezo_ident.report.json_data import to_json as to_json
+    from piezo_ident.report.picture import model_text as model_text
+    from piezo_ident.report.picture import plot as plot
+    from piezo_ident.report.picture import to_html as to_html
+    from piezo_ident.report.picture import to_text as to_text
+
+#: public names by their modules: importing all takes half a second, and most callers need one
+_HOMES = {
+    'advice': ('next_steps', 'Prompt', 'Step'),
+    'diagnosis': ('diagnosis_text',),
+    'folder': ('check_report_folder', 'write_report'),
+    'identification': ('headline', 'identification_text', 'table_one'),
+    'json_data': ('json_text', 'steps_to_json', 'to_json'),
+    'picture': ('model_text', 'plot', 'save_plot', 'to_html', 'to_text'),
+    'refined': ('validated',),
+    'table': ('length',),
+}
+__all__ = [name for names in _HOMES.values() for name in names]
+
+
+def __getattr__(name: str) -> Any:
+    home = next((home for home, names in _HOMES.items() if name in names), None)
+    if home is None:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(importlib.import_module(f'{__name__}.{home}'), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 import math
 from platform import python_version
 
@@ -22,7 +22,7 @@ from piezo_ident.diagnosis.results import (
 from piezo_ident.effects import find_effect
 from piezo_ident.model import metrics
 from piezo_ident.model.multi_axis import EachAxis
-from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
+from piezo_ident.report.html import Box, named, Page, page_text, pairs, Section, Shown
 from piezo_ident.report.refined import law_told
 from piezo_ident.report.table import (
     FAULTS,
@@ -30,23 +30,17 @@ from piezo_ident.report.table import (
     listed,
     number,
     origin_tables,
-    plain_text,
     share_text,
     Table,
     table,
 )
-from piezo_ident.residual.reversals import Way, ways
 
 #: columns of every table of errors
 STATES = ('as given', 'H refitted', 'refined')
-#: what the source of a noise floor that is unknown may begin with
+#: beginning of the source of an unknown noise floor
 UNKNOWN = 'floor unknown: '
 #: candidates in a summary, at most
 CANDIDATES = 6
-#: what is near a reversal, share of the voltage range behind it
-NEAR = 0.05
-#: a residual stands near the reversals when it is this much larger there than elsewhere
-STANDS = 1.25
 FOOTER = (
     'Every error is of a free run, never of one-step prediction. Base model: Gu, Li, Zhu and Su, '
     'IEEE/ASME Trans. Mechatronics 21(3), 2016, doi:10.1109/TMECH.2015.2465868. Beside this page: '
@@ -108,8 +102,8 @@ def unseen_tables(result: Diagnosis) -> list[Table]:
         'Records that took no part, errors in % of stroke',
         ('', STATES[0], STATES[2], f'{STATES[0]}, no mean', f'{STATES[2]}, no mean', 'samples'),
         rows,
-        f'{metrics.FORMULA}. No mean: without the mean of the error, since a sensor may have been '
-        'set to zero between two records. Sines: steady state.',
+        f'{metrics.FORMULA}. No mean: the mean of the error is subtracted, as a sensor may have '
+        'been set to zero between two records. Sines: steady state.',
     )
 
 
@@ -144,16 +138,16 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
     note = (
         'In units of the normalised chain: 1 is the full span, '
         f'{number(scaling.V, 4)} V of the voltage or {length(abs(scaling.Y))} of the '
-        'displacement. ±: standard deviation; no ± where a parameter was not moved.'
+        'displacement. ±: standard deviation of a fitted parameter.'
     )
     timed = [e.name for e in result.effects if find_effect(e.name).time_driven]
     if timed:
         note += (
-            f' {", ".join(timed)}: of the longest record; such an effect follows time, so the '
-            'refined model carries what can be expected of it in another one.'
+            f' {", ".join(timed)}: values of the longest record. Such an effect follows time; the '
+            'refined model carries its expected size in another record.'
         )
     head = ('effect', 'parameter', 'unit', '', 'value')
-    # lists are long, and the last column is the one that wraps
+    # lists are long, and the last column wraps
     rows = [
         (effect, name, unit, about, x) for effect, name, x, unit, about in parameter_rows(result)
     ]
@@ -182,7 +176,7 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
     noise = 'unknown' if floor is None else f'{number(floor)} % of stroke, rms of single samples'
     size = f'{number(left.rms_percent)} % of stroke'
     rows = [
-        # nothing was added that could have a share
+        # a share belongs to an effect
         ('unexplained', (_left(result, left) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
         *(('hysteresis', text) for text in law_told(result)),
@@ -194,11 +188,11 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _stands_for(result: Diagnosis) -> str:
-    """Return the motions for which the error of the refined model stands."""
+    """Describe the motions for which the error of the refined model holds."""
     if not result.kinds:
-        return 'for motion like that of these data alone: parts were predicted from the rest'
+        return 'for similar motion alone: parts were predicted from the rest of these data'
     kinds = listed(result.kinds)
-    return f'for motion of the kinds in these data, each predicted from the others: {kinds}'
+    return f'for motion of these kinds, each predicted from the others: {kinds}'
 
 
 def _left(result: Diagnosis, part: FoundEffect | Unexplained) -> str:
@@ -207,67 +201,9 @@ def _left(result: Diagnosis, part: FoundEffect | Unexplained) -> str:
     )
 
 
-def ways_of(result: Diagnosis) -> tuple[Way, ...]:
-    """Return the three residuals by the way since a turn [% of stroke]."""
-    stroke = max(float(np.ptp(r.piece.y)) for r in result.residuals)
-    found = ways(
-        [(r.piece.v, r.sound, r.piece.sample_rate) for r in result.residuals],
-        [[r.given, r.before, r.after] for r in result.residuals],
-    )
-    return tuple(
-        replace(way, rms=tuple(metrics.percent(rms, stroke) for rms in way.rms)) for way in found
-    )
-
-
-def _reversal_tables(found: Sequence[Way]) -> list[Table]:
-    return table(
-        'By the way since the voltage last turned',
-        ('share of the range', *STATES, 'means'),
-        [
-            (f'{share_text(w.start)} .. {share_text(w.stop)}', *map(number, w.rms), str(w.n))
-            for w in found
-        ],
-        'In % of stroke: rms of the residual, free run, means over 2 ms; fitted to all of these '
-        'data.',
-    )
-
-
-def reversal_text(result: Diagnosis, found: Sequence[Way]) -> str:
-    """Return how large the residual near the reversals is; empty where it is no larger there."""
-    near = [w for w in found if w.stop <= NEAR]
-    far = [w for w in found if w.stop > NEAR]
-    if not near or not far:
-        return ''
-    given, refitted, refined = _rms(near)
-    elsewhere = _rms(far)
-    if given < STANDS * elsewhere[0]:
-        return ''
-    text = (
-        f'Near the reversals (the first {share_text(NEAR)} of the range behind a turn) the model '
-        f'as given misses {number(given)} % of stroke, elsewhere {number(elsewhere[0])} %. '
-    )
-    if result.effects and not result.changes:
-        return text.rstrip()
-    names = ' and '.join(e.name.replace('_', ' ') for e in result.effects)
-    text += (
-        f'{share_text(1.0 - (refitted / given) ** 2)} of its square go when H is '
-        'refitted on finer thresholds: so far it was the shape of the loop behind a turn'
-    )
-    if result.effects and refined < refitted:
-        text += f'; {share_text((refitted**2 - refined**2) / given**2)} with {names}'
-    last, there = (refined, elsewhere[2]) if result.effects else (refitted, elsewhere[1])
-    return f'{text}. {number(last)} % stay, elsewhere {number(there)} %.'
-
-
-def _rms(some: Sequence[Way]) -> tuple[float, ...]:
-    n = np.array([w.n for w in some])
-    squares = np.array([w.rms for w in some]) ** 2
-    return tuple(float(x) for x in np.sqrt(n @ squares / n.sum()))
-
-
 def _added(result: Diagnosis) -> list[str]:
     return [
-        f'{effect.name} (slot: {effect.slot}), {_left(result, effect)}'
+        f'added: {effect.name} (slot: {effect.slot}), {_left(result, effect)}'
         for effect in result.effects
     ]
 
@@ -275,10 +211,9 @@ def _added(result: Diagnosis) -> list[str]:
 def _alike(result: Diagnosis) -> list[str]:
     if result.group is None:
         return []
-    names, what = ', '.join(result.group.names), 'what would'
-    if not result.effects:
-        names, what = f'{names}, which may hide in the base model', 'what would tell'
-    return [names, f'{what}: {result.group.separating_experiment}']
+    names = ', '.join(result.group.names)
+    hide = '' if result.effects else ', which may hide in the base model'
+    return [names + hide, f'an experiment that would: {result.group.separating_experiment}']
 
 
 def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]:
@@ -286,9 +221,7 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     title, n = 'Candidates that were not added', len(rows)
     if most is not None and n > most:
         title, rows = f'{title}, the first {most} of {n}', rows[:most]
-    note = (
-        'Share of the error left by the best hysteresis that each candidate removes, added alone.'
-    )
+    note = 'Share: part of the error, with the best hysteresis, that the candidate removes alone.'
     return table(title, ('effect', 'share', 'why not'), rows, note)
 
 
@@ -303,16 +236,38 @@ def _fault_tables(result: Diagnosis) -> list[Table]:
 
 
 def diagnosis_page(
-    result: Diagnosis, pictures: Sequence[Shown], left_out: Sequence[tuple[str, str]]
+    result: Diagnosis,
+    pictures: Sequence[Shown] = (),
+    left_out: Sequence[tuple[str, str]] = (),
+    candidates: int | None = None,
 ) -> Page:
-    """Return the page; `left_out` holds titles of pictures that cannot be drawn, with reasons."""
+    """
+    Return the page.
+
+    `left_out` holds titles of missing pictures, with reasons; `candidates` limits their table.
+    """
     warnings = list(result.warnings)
     if result.faults:
         warnings.append('the data had faults, see the table near the end')
-    found = ways_of(result)
-    changed = ', '.join(result.changes)
     versions = {'piezo_ident': __version__, 'python': python_version(), 'numpy': np.__version__}
     origin = origin_tables(asdict(result.settings), 'the whole catalogue', versions)
+    errors: list[Shown | Table] = [
+        *named(pictures, 'errors'),
+        error_table(result),
+        *unseen_tables(result),
+    ]
+    shown = named(pictures, 'residual', 'signature', 'spectrum', 'coherence')
+    refined = ', '.join(result.changes) or 'the same as the given model'
+    found: list[str | Table] = [
+        *_added(result),
+        *_parameter_tables(result),
+        f'Refined model: {refined}.',
+    ]
+    remain = [
+        Table('Rest', ('', ''), remains(result)),
+        *_untestable_tables(result),
+        *_fault_tables(result),
+    ]
     return Page(
         title='Diagnosis of a piezo stage',
         source=', '.join(result.records),
@@ -323,35 +278,12 @@ def diagnosis_page(
             Box('missing', 'These data cannot tell apart', _alike(result)),
         ),
         sections=(
-            Section(
-                'Error before and after',
-                [*named(pictures, 'errors'), error_table(result), *unseen_tables(result)],
-            ),
-            Section(
-                'The residual before and after',
-                [
-                    reversal_text(result, found),
-                    *named(pictures, 'residual', 'signature', 'spectrum', 'coherence'),
-                    *_reversal_tables(found),
-                ],
-            ),
-            Section(
-                'What was found',
-                [
-                    *_added(result),
-                    *_parameter_tables(result),
-                    f'Refined model: {changed or "the same as the one that was given"}.',
-                ],
-            ),
-            Section('What was not, and why', _candidate_tables(result)),
-            Section(
-                'What remains',
-                [
-                    Table('What the model leaves', ('', ''), remains(result)),
-                    *_untestable_tables(result),
-                ],
-            ),
-            Section('Origin', [*_fault_tables(result), *origin]),
+            Section('Error before and after', errors, brief=True),
+            Section('The residual before and after', shown),
+            Section('Effects that were found', found, brief=True),
+            Section('Candidates', _candidate_tables(result, candidates), brief=True),
+            Section('Remaining error', remain, brief=True),
+            Section('Origin', origin),
         ),
         after=(Box('missing', 'Pictures that these data do not allow', pairs(left_out)),),
         footer=FOOTER,
@@ -362,23 +294,7 @@ def diagnosis_text(result: Diagnosis | EachAxis[Diagnosis]) -> str:
     """Return verdict, errors before and after, and the effects tried, for a terminal."""
     if isinstance(result, EachAxis):
         return result.told(diagnosis_text)
-    alike = _alike(result)
-    return plain_text(
-        [
-            headline(result),
-            error_table(result),
-            *unseen_tables(result),
-            reversal_text(result, ways_of(result)),
-            Table('', ('', ''), [*facts(result)[:2], *remains(result)]),
-            *(f'added: {text}' for text in _added(result)),
-            *_parameter_tables(result),
-            f'these data cannot tell apart: {"; ".join(alike)}' if alike else '',
-            *_candidate_tables(result, CANDIDATES),
-            *_untestable_tables(result),
-            *_fault_tables(result),
-            *(f'warning: {warning}' for warning in result.warnings),
-        ]
-    )
+    return page_text(diagnosis_page(result, candidates=CANDIDATES), result.warnings)
 
 
 def brief_table(result: Diagnosis) -> Table:

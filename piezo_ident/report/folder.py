@@ -21,11 +21,11 @@ from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
+from piezo_ident.report.advice import next_steps, Prompt
 from piezo_ident.report.diagnosis import diagnosis_page
 from piezo_ident.report.html import Page, page_html, Shown
 from piezo_ident.report.identification import identification_page
-from piezo_ident.report.next_steps import next_steps, Prompt
-from piezo_ident.report.to_json import to_json
+from piezo_ident.report.json_data import to_json
 
 if TYPE_CHECKING:
     from piezo_ident.report.figures.style import Drawn

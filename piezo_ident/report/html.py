@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
-from piezo_ident.report.next_steps import Step
-from piezo_ident.report.table import Table
+from piezo_ident.report.table import plain_text, Table
 
 if TYPE_CHECKING:
     import jinja2
@@ -66,11 +65,20 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Step:
+    """Why to do something, and the command that does it."""
+
+    reason: str
+    command: str
+
+
+@dataclass(frozen=True)
 class Section:
-    """What stands below a heading; None is left out."""
+    """Parts below a heading; None is left out.  Only `brief` sections are shown on a terminal."""
 
     title: str
     parts: Sequence[Table | Shown | Step | Link | str | None]
+    brief: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,21 @@ class Page:
     after: Sequence[Box]
     footer: str
     next_steps: Sequence[Step] = ()
+
+
+def page_text(page: Page, warnings: Iterable[str]) -> str:
+    """Return headline, facts, brief sections, boxes and warnings of a page for a terminal."""
+    brief = [part for section in page.sections if section.brief for part in section.parts]
+    boxes = [box for box in page.before if box.kind != 'warnings']
+    return plain_text(
+        [
+            page.headline,
+            Table('', ('', ''), page.facts),
+            *(part for part in brief if isinstance(part, (str, Table))),
+            *(f'{box.title.lower()}: {item}' for box in boxes for item in box.items),
+            *(f'warning: {warning}' for warning in warnings),
+        ]
+    )
 
 
 def named(pictures: Sequence[Shown], *names: str) -> list[Shown]:

@@ -16,7 +16,7 @@ from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.metrics import FORMULA, KINDS, percent
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import SineError
-from piezo_ident.report.html import Box, named, Page, pairs, Section, Shown
+from piezo_ident.report.html import Box, named, Page, page_text, pairs, Section, Shown
 from piezo_ident.report.table import (
     FAULTS,
     length,
@@ -32,9 +32,9 @@ from piezo_ident.report.table import (
 ABOUT = {
     'validation': 'On {records}, recorded for validation',
     'held out': 'On data held out of the fit',
-    'selection': 'On the parts of steps, noise and triangle that were held out from the fit (no '
-    'other motion was there to test it)',
-    'fitted': 'Nothing was held out; on the data it was fitted to',
+    'selection': 'On the parts of steps, noise and triangle that were held out from the fit (the '
+    'only motion to test it)',
+    'fitted': 'Nothing was held out; on the fitted data',
 }
 #: static gain that the paper leaves in G: its printed coefficients give G(1) = 0.6411
 PAPER_GAIN = 0.6411
@@ -47,7 +47,7 @@ FOOTER = (
 
 def headline(result: Identification) -> str:
     """
-    Return in one sentence by how much the model errs, and its hysteresis alone.
+    Tell the error of the model, and of its hysteresis alone, in one sentence.
 
     Both errors are over the same samples, see `Identification.headline`.
     """
@@ -97,14 +97,14 @@ def _law(result: Identification) -> str:
 
 
 def _stands_for(result: Identification) -> str:
-    """Return the motions for which the error of the headline stands."""
+    """Describe the motions for which the error of the headline holds."""
     data = result.headline.data
     rows = [row for row in result.errors if row.data == data and row.driven]
     labels = dict.fromkeys(row.segment for row in rows if row.segment)
     if data == 'fitted' or not rows:
         return ''
     if not labels:
-        return 'for motion like that of these records: other parts of them were fitted'
+        return 'for similar motion: other parts of these records were fitted'
     return f'for motion of these kinds: {listed(labels)}'
 
 
@@ -124,15 +124,15 @@ def error_table(result: Identification) -> Table:
         ('record', 'segment', 'data', 'model', 'hysteresis alone', 'NRMSE fit / %', 'samples'),
         cells,
         f'{FORMULA}, with the stroke of the whole record. NRMSE fit: '
-        '100 (1 - |y - y_hat| / |y - mean y|) over the samples of the row; it says nothing '
-        'where the stage rests. "validation": of a record that took no part; "held out": neither '
-        'fitted nor looked at before; "selection": not fitted, but chose between models. '
+        '100 (1 - |y - y_hat| / |y - mean y|) over the samples of a row in motion. "validation": '
+        'a record beside the fit. "held out": samples for this error alone. "selection": samples '
+        'that chose between models. '
         f'Sensor noise: {source}{result.noise_source}.',
     )
 
 
 def _fit(row: ErrorRow) -> str:
-    # at rest there is nothing but noise to explain, and a good model looks like a bad one
+    # at rest only noise is left to explain, and a good model looks like a bad one
     if row.segment.partition(':')[0] == 'idle' or not math.isfinite(row.fit):
         return '–'
     # adding zero turns a negative zero into a plain one
@@ -149,9 +149,8 @@ def sine_tables(rows: Sequence[SineError]) -> list[Table]:
         'Errors of sines in steady state, % of stroke',
         ('frequency / Hz', *(f'{row.frequency:g}' for row in rows)),
         errors if rows else [],
-        f'{FORMULA}; the first second and at least one period are dropped, and the stroke is '
-        'that of what is left. '
-        'Layout of Table I of the paper.',
+        f'{FORMULA}, without the first second and at least one period; the stroke is counted '
+        'there, too. Layout of Table I of the paper.',
     )
 
 
@@ -199,8 +198,8 @@ def dynamics_tables(result: Identification) -> list[Table]:
         for mode in G.modes(model.sample_rate, dynamics.covariance)
     ]
     note = (
-        'A mode whose uncertainty is as large as itself only helps the others to fit. The data '
-        f'tell G up to {number(dynamics.known_to, 4)} Hz; what lies above is an extrapolation.'
+        'A mode with an uncertainty of its own size only helps the other modes to fit. The data '
+        f'show G up to {number(dynamics.known_to, 4)} Hz; higher frequencies are extrapolated.'
     )
     tables += table('Modes of G', ('frequency / Hz', '± / Hz', 'damping ratio', '±'), modes, note)
     methods = [
@@ -242,8 +241,8 @@ def hysteresis_tables(result: Identification) -> list[Table]:
         'Laws of H compared',
         ('law', 'error of parts / % of stroke'),
         laws,
-        'Geometric mean over parts of the data, each predicted from the others. A wider law than '
-        'plays has to err by a quarter less.'
+        'Geometric mean over parts of the data, each predicted from the other parts. A wider law '
+        'than plays must err by a quarter less.'
         + (
             ''
             if fit.law == 'plays'
@@ -262,9 +261,8 @@ def hysteresis_tables(result: Identification) -> list[Table]:
             'Weights of H',
             ('', 'r / V', 'r', 'weight', '±', f'weight / {PAPER_GAIN}'),
             rows,
-            'Normalised, for white residuals. The play at r = 0 is v itself, so p2 holds its '
-            'weight too. H carries the static gain here; the last column is in the split of the '
-            f'paper, where G(1) = {PAPER_GAIN}.',
+            'Normalised, for white residuals. The play at r = 0 is v itself; p2 holds its weight. '
+            f'H carries the static gain; in the last column G carries {PAPER_GAIN}, as printed.',
         ),
         Table(
             'Solver of the weights',
@@ -279,11 +277,11 @@ def hysteresis_tables(result: Identification) -> list[Table]:
 
 def identification_page(
     result: Identification,
-    sines: Sequence[SineError],
-    pictures: Sequence[Shown],
-    left_out: Sequence[tuple[str, str]],
+    sines: Sequence[SineError] = (),
+    pictures: Sequence[Shown] = (),
+    left_out: Sequence[tuple[str, str]] = (),
 ) -> Page:
-    """Return the page; `left_out` holds titles of pictures that cannot be drawn, with reasons."""
+    """Return the page; `left_out` holds titles of missing pictures, with reasons."""
     faults = [
         (record.name, fault.name, str(fault.count), fault.where, fault.action)
         for record in result.records
@@ -315,6 +313,7 @@ def identification_page(
                     *sine_tables(sines),
                     *named(pictures, 'sines', 'loops', 'segments', 'overview'),
                 ],
+                brief=True,
             ),
             Section(
                 'Delay and dynamics',
@@ -338,15 +337,7 @@ def identification_text(result: Identification | EachAxis[Identification]) -> st
     """Return headline, facts, errors and warnings for a terminal."""
     if isinstance(result, EachAxis):
         return result.told(identification_text)
-    return plain_text(
-        [
-            headline(result),
-            Table('', ('', ''), facts(result)),
-            error_table(result),
-            *(f'not identified: {item}' for item in pairs(result.not_identified)),
-            *(f'warning: {item}' for item in result.warnings),
-        ]
-    )
+    return page_text(identification_page(result), result.warnings)
 
 
 def brief_table(result: Identification) -> Table:

@@ -12,23 +12,22 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
-from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.identification.results import Identification
 from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
 from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.record.record import Record
-from piezo_ident.report import diagnosis, identification
 from piezo_ident.report.html import Shown, summary_html
 from piezo_ident.report.table import length, number, plain_text, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from piezo_ident.control.inverse import Inverse
+    from piezo_ident.diagnosis.results import Diagnosis
+    from piezo_ident.identification.results import Identification
     from piezo_ident.model.front_door import ModelParameter
     from piezo_ident.model.stage_model import StageModel
 
-    Result = Identification | Diagnosis | FreeRun | Inverse
+    Result = Identification | Diagnosis | FreeRun | Inverse | Record
 
 #: endings that a picture may have
 ENDINGS = ('.png', '.pdf', '.svg')
@@ -36,7 +35,7 @@ ENDINGS = ('.png', '.pdf', '.svg')
 DPI = 110
 
 
-def plot(result: Result | Record) -> Figure:
+def plot(result: Result) -> Figure:
     """
     Draw the picture that tells most of a result.
 
@@ -57,20 +56,25 @@ def plot(result: Result | Record) -> Figure:
     NothingToDraw
         When the result holds no data.
     """
-    from piezo_ident.report.figures.diagnosis import worst_pieces
-    from piezo_ident.report.figures.drive import drive_figure
+    # imported by and by: the modules of a diagnosis take half a second
+    from piezo_ident.control.inverse import Inverse
     from piezo_ident.report.figures.free_run import loops_figure, overview_figure, record_figure
-    from piezo_ident.report.figures.residual import residual_figure
 
     if isinstance(result, Record):
         return record_figure(result)
-    if isinstance(result, Identification):
-        return loops_figure(piece_runs(result.model, result.records, result.memories))
+    if isinstance(result, FreeRun):
+        return overview_figure(_longest(result))
+    if isinstance(result, Inverse):
+        from piezo_ident.report.figures.drive import drive_figure
+
+        return drive_figure(result)
+    from piezo_ident.diagnosis.results import Diagnosis
+    from piezo_ident.report.figures.diagnosis import worst_pieces
+    from piezo_ident.report.figures.residual import residual_figure
+
     if isinstance(result, Diagnosis):
         return residual_figure(worst_pieces(result, 1)[0])
-    if not isinstance(result, FreeRun):
-        return drive_figure(result)
-    return overview_figure(_longest(result))
+    return loops_figure(piece_runs(result.model, result.records, result.memories))
 
 
 def _longest(result: FreeRun) -> PieceRun:
@@ -111,12 +115,12 @@ def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> N
         drawn.savefig(file, dpi=style.DPI)
 
 
-def to_text(result: Result | Record) -> str:
+def to_text(result: Result) -> str:
     """Return headline and table of a result as text, for a prompt."""
     return plain_text(_summary(result))
 
 
-def to_html(result: Result | Record) -> str:
+def to_html(result: Result) -> str:
     """Return headline, table and picture of a result as HTML, for a notebook."""
     from piezo_ident.report.figures.style import png
 
@@ -156,14 +160,21 @@ def model_text(model: StageModel) -> str:
     return plain_text([Table('Model', ('', ''), rows, FORMULA)])
 
 
-def _summary(result: Result | Record) -> tuple[str, Table]:
-    if isinstance(result, Identification):
-        return identification.headline(result), identification.brief_table(result)
-    if isinstance(result, Diagnosis):
-        return diagnosis.headline(result), diagnosis.brief_table(result)
+def _summary(result: Result) -> tuple[str, Table]:
     if isinstance(result, Record):
         return _record(result)
-    return _free_run(result) if isinstance(result, FreeRun) else _drive(result)
+    if isinstance(result, FreeRun):
+        return _free_run(result)
+    from piezo_ident.control.inverse import Inverse
+
+    if isinstance(result, Inverse):
+        return _drive(result)
+    from piezo_ident.diagnosis.results import Diagnosis
+    from piezo_ident.report import diagnosis, identification
+
+    if isinstance(result, Diagnosis):
+        return diagnosis.headline(result), diagnosis.brief_table(result)
+    return identification.headline(result), identification.brief_table(result)
 
 
 def _record(record: Record) -> tuple[str, Table]:
@@ -181,13 +192,22 @@ def _record(record: Record) -> tuple[str, Table]:
 
 
 def _free_run(result: FreeRun) -> tuple[str, Table]:
-    errors = result.errors_after_start or result.errors
-    text = f'On {result.record.name} the model errs by {number(errors.percent)} % of stroke'
-    rows = [('error', f'{number(errors.percent)} % of stroke')]
-    rows += [('without its mean', f'{number(errors.percent_without_offset)} % of stroke')]
-    rows += [('mean', length(errors.offset)), ('NRMSE fit', f'{number(errors.fit, 4)} %')]
-    rows += [('samples', str(errors.n))]
+    parts = [('whole record', result.errors)]
+    late, rows = result.errors_after_start, []
+    if late is not None and any(result.estimated):
+        parts.append(('start forgotten', late))
+    for name, e in parts:
+        counts = f'NRMSE fit {number(e.fit, 4)} %, {e.n} samples'
+        rows.append((name, f'{number(e.percent)} % of stroke, {counts}'))
+        if e.mostly_offset:
+            zero = ': the sensor was set to zero elsewhere' if e.only_offset else ''
+            left = f'{number(e.percent_without_offset)} % after removing a mean of'
+            rows.append(('', f'{left} {length(e.offset)}{zero}'))
+    if late is None:
+        rows.append(('start', 'no sample at which it is forgotten: drive a wider range'))
     rows += [('warning', warning) for warning in result.warnings]
+    error = number((late or result.errors).percent)
+    text = f'On {result.record.name} the model errs by {error} % of stroke'
     return f'{text} ({FORMULA}).', Table('Free run', ('', ''), rows)
 
 

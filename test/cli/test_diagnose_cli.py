@@ -21,7 +21,7 @@ from piezo_ident.effects import catalogue
 from piezo_ident.model.files import load
 from piezo_ident.model.free_run import free_run
 from piezo_ident.record.record import Record
-from piezo_ident.report.to_json import diagnosis_schema
+from piezo_ident.report.json_data import diagnosis_schema
 from programs import SLOW, slow_model
 import pytest
 
@@ -262,7 +262,7 @@ def test_one_effect(capsys, name):
     assert text.startswith(f'{name}  (slot: {effect["slot"]})\n')
     for p in catalogue()[name].parameters:
         (row,) = [line for line in text.splitlines() if line.startswith(f'{p.name}  ')]
-        assert p.description in row
+        assert p.description in ' '.join(text.split())
         if p.kind == 'number':
             assert f'{p.lower:g}' in row
             assert f'{p.upper:g}' in row

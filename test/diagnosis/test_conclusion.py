@@ -17,7 +17,7 @@ from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report.diagnosis import diagnosis_text
-from piezo_ident.report.to_json import to_json
+from piezo_ident.report.json_data import to_json
 from programs import slow_model
 import pytest
 import truths

@@ -20,8 +20,8 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import diagnosis_text
 from piezo_ident.report.figures import style
+from piezo_ident.report.json_data import diagnosis_schema
 from piezo_ident.report.table import number
-from piezo_ident.report.to_json import diagnosis_schema
 from programs import SLOW, slow_model
 import pytest
 

@@ -56,7 +56,7 @@ def test_what_differs_is_named_with_its_column(capsys):
     }
     _print(rows, rows[:1], SimpleNamespace(say=print))  # type: ignore[arg-type]
     said = capsys.readouterr().out
-    assert '  stage_29: sampling rate 5000 Hz (1e+04), delay 7 samples (3)' in said
+    assert '  stage_29: sample rate 5000 Hz (1e+04), delay samples 7 (3)' in said
     assert '  stage_4: gain 0.4 µm/V (0.' in said
 
 

@@ -113,6 +113,6 @@ def test_a_summary_names_range_modes_delay_and_effects():
 def test_every_result_becomes_json(record):
     run = pi.free_run(PAPER, record)
     drive = pi.invert(PAPER, 20e-6 * (1.5 - np.cos(np.arange(2000) / 100)))
-    assert run.to_json()['errors']['whole_record']['percent'] == run.errors.percent
-    assert drive.to_json()['errors']['inversion'] == drive.error
+    assert run.to_json()['whole']['percent_of_stroke'] == run.errors.percent
+    assert drive.to_json()['percent_of_stroke'] == drive.error
     assert record.to_json()['samples'] == record.n

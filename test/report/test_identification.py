@@ -134,7 +134,7 @@ def test_facts_tell_the_law_and_the_motions_that_the_error_stands_for(identified
     assert 'sine:100Hz' in about['error holds']
     wide = replace(identified, hysteresis=replace(identified.hysteresis, law='preisach'))
     assert dict(facts(wide))['hysteresis'].startswith('not a sum of plays: ')
-    assert 'like that of these records' in dict(facts(unlabelled))['error holds']
+    assert 'similar motion' in dict(facts(unlabelled))['error holds']
     assert 'error holds' not in dict(facts(replace(identified, errors=())))
 
 

@@ -29,8 +29,8 @@ BEFORE, AFTER = 10, 15
 WORST = 10.0
 #: the axis of magnitudes spans this factor at least
 LEAST_RANGE = 4.0
-#: a mode is named in a frequency response up to this damping ratio and relative uncertainty,
-#: and this far from other names, as a share of the width
+#: largest damping ratio and relative uncertainty of a mode that is named in a response, and
+#: smallest distance of two names as a share of the width
 DAMPED, UNSURE, APART = 0.5, 0.1, 0.09
 
 
@@ -45,7 +45,7 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Fi
     if step is None and result.loss is None:
         if result.source == 'given':
             raise NothingToDraw('the delay was given, not measured')
-        raise NothingToDraw('no steps and no noise segment to read a delay from')
+        raise NothingToDraw('a delay is read from steps or a noise segment')
     fig = style.figure(2.7)
     axes = fig.subplots(1, (step is not None) + (result.loss is not None), squeeze=False)[0]
     if step is not None:
@@ -137,12 +137,12 @@ def response_figure(identification: Identification) -> Figure:
     model, dynamics = identification.model, identification.dynamics
     measured = dynamics.response
     if measured is None and model.dynamics.is_static:
-        raise NothingToDraw('no broadband motion, and no dynamics were identified')
+        raise NothingToDraw('neither motion nor model shows dynamics')
     rate = model.sample_rate
     top = 0.5 * rate if measured is None else float(measured.frequency[-1])
     low = top / 300.0 if measured is None else float(measured.frequency[0])
     f = np.geomspace(low, top, 800)
-    # without a slope what was measured is G itself, behind the hysteresis
+    # without a slope the measured response is G itself, behind the hysteresis
     slope = dynamics.slope_model
     if not np.isfinite(slope):
         slope = dynamics.slope_measured
@@ -222,13 +222,13 @@ def _draw_measured(
 
 def orders_figure(identification: Identification) -> Figure:
     """
-    Draw the held-out error of every order, with the chosen one and what the criteria prefer.
+    Draw the held-out error of every order, with the chosen order and the choices of criteria.
 
     NothingToDraw when no table of orders was made, or it is a single line.
     """
     table = identification.dynamics.table
     if table is None:
-        raise NothingToDraw('orders are compared on a noise segment, and there is none')
+        raise NothingToDraw('orders are compared on a noise segment')
     if min(table.held_out.shape) < 2 or not np.isfinite(table.held_out).any():
         raise NothingToDraw('a single order was tried')
     best = float(np.min(table.held_out))

@@ -42,9 +42,9 @@ def draw_diagnosis(
         (
             'errors',
             'Error before and after',
-            'Free run of the model as it was given, and of the refined model, fitted to other '
-            'kinds of motion. Where an effect was added, also of the given model with H refitted '
-            'to other blocks of these data.',
+            'Free run of the given model, and of the refined model, fitted to other kinds of '
+            'motion. With an added effect, the given model with H refitted to other blocks is '
+            'drawn, too.',
             lambda: errors_figure(diagnosis),
         ),
     ]
@@ -68,7 +68,7 @@ def draw_diagnosis(
             'What the residual depends on',
             f'{what} Mean over the voltage, its rate, and the time since a step '
             '(there multiplied by the size of the step), with two standard '
-            'deviations. What is left should be flat.',
+            'deviations. A complete model leaves flat curves.',
             lambda: residual_dependence_figure(*analyses()),
         ),
         (
@@ -94,7 +94,7 @@ def worst_pieces(diagnosis: Diagnosis, most: int = TRACES) -> list[Residual]:
 
 
 def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis | None]:
-    """Return what the residual shows before, and after where something was added."""
+    """Analyse the residual before, and after if an effect was added."""
 
     def analysed(name: str) -> ResidualAnalysis:
         return analyse(
@@ -114,7 +114,7 @@ def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis 
 
 
 def _is_refit(diagnosis: Diagnosis) -> bool:
-    """Return whether the refined model is the given one with another H alone."""
+    """Whether the refined model differs from the given model by its H alone."""
     return not differ(diagnosis.residuals) and not all(
         np.array_equal(r.given, r.after) for r in diagnosis.residuals
     )

@@ -82,7 +82,7 @@ def _loop(
 def _draw_error(
     axes: Axes, x: Array, e: Array, e_static: Array, width: float
 ) -> tuple[str, float]:
-    """Draw errors [m], that of the hysteresis alone where both are readable; return the unit."""
+    """Draw errors [m], with the hysteresis alone if both are readable; return the unit."""
     limit, largest = style.axis_limit(e)
     unit, scale = style.length_unit(largest)
     remarks = [f'axis cut; largest {scale * largest:.3g} {unit}'] if largest > limit else []
@@ -174,7 +174,7 @@ def segments_figure(runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], s
     heights = [0.12] + [1.6, 1.0] * rows
     grid = fig.add_gridspec(2 * rows + 1, min(2, len(cells)), height_ratios=heights)
     for i, (run, s) in enumerate(cells):
-        # one that is left takes the whole row
+        # the last of an odd number takes the whole row
         across = slice(None) if i % 2 == 0 and i + 1 == len(cells) else i % 2
         trace = fig.add_subplot(grid[2 * (i // 2) + 1, across])
         error = fig.add_subplot(grid[2 * (i // 2) + 2, across], sharex=trace)
@@ -192,7 +192,7 @@ def segments_figure(runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], s
 
 
 def _readable(run: PieceRun, s: Segment) -> tuple[slice, str]:
-    """Return what of a segment is readable in a small picture, and its name."""
+    """Choose the readable part of a segment for a small picture; the part and its name."""
     frequency = sine_frequency(s.label)
     if frequency is not None:
         period = run.piece.sample_rate / frequency

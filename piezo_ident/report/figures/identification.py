@@ -63,11 +63,11 @@ def draw_identification(
         (
             'segments',
             'Segments',
-            'Free run and its error; that of the hysteresis alone is drawn where both can be read '
-            'on one scale. Percentages are of the stroke of the whole record'
+            'Free run and its error, with the error of the hysteresis alone if one scale suits '
+            'both. Percentages are of the stroke of the whole record'
             + (
-                '; those fitted and held out are of the model before H was fitted to all, the '
-                'curves of the final one.'
+                '; fitted and held-out errors belong to the model before H was fitted to all, the '
+                'curves to the final model.'
                 if refitted
                 else '.'
             ),
@@ -108,10 +108,10 @@ def _overviews(runs: Sequence[PieceRun], refitted: Mapping[str, float]) -> list[
         if runs[i].record in refitted:
             error = f'{number(refitted[runs[i].record])} %'
             caption += (
-                ' In the end the weights of H were fitted to all of the record: the error drawn '
-                f'is no test. What was held out before that was missed by {error} of stroke.'
+                ' In the end H was fitted to the whole record; the drawn error is one of the fit. '
+                f'Samples held out before were missed by {error} of stroke.'
             )
-            remark = f'H fitted to all of it; error of what was held out before: {error}'
+            remark = f'H fitted to all of it; error on samples held out before: {error}'
         wanted.append(
             (
                 f'overview_{k}',
@@ -124,11 +124,11 @@ def _overviews(runs: Sequence[PieceRun], refitted: Mapping[str, float]) -> list[
 
 
 def _of_response(dynamics: DynamicsResult) -> str:
-    """Return how the frequency response was measured, if it was."""
+    """Describe how the frequency response was measured, if it was."""
     if dynamics.response is None:
         response = (
-            'G(z) z^-d of the model. Nothing that the voltage does has the breadth to measure it: '
-            'add steps, noise or a multisine.'
+            'G(z) z^-d of the model. The motion is too narrow in frequency to measure it: add '
+            'steps, noise or a multisine.'
         )
     elif np.isfinite(dynamics.slope_measured):
         response = (
@@ -137,15 +137,15 @@ def _of_response(dynamics: DynamicsResult) -> str:
         )
     else:
         response = (
-            'Measured on all fast motion (Welch) from the voltage behind H to the displacement, '
-            'where it errs by less than 10 %, and G(z) z^-d of the model.'
+            'Measured on all fast motion (Welch) from the output of H to the displacement, at '
+            'frequencies with errors below 10 %, and G(z) z^-d of the model.'
         )
-    return f'{response} Where the two part, G lacks something.'
+    return f'{response} G lacks a part of the stage at frequencies of disagreement.'
 
 
 def _refitted(identification: Identification) -> dict[str, float]:
-    """Return the error that was held out of each record to all of which H was fitted then."""
-    # with segments there is a table of orders; what the swarm found is not fitted again
+    """Return the held-out error of each record to which H was fitted as a whole later."""
+    # a table of orders comes with segments, and a fit of the swarm stays as it is
     if (
         identification.dynamics.table is not None
         or identification.hysteresis.solver != 'least_squares'
@@ -161,13 +161,13 @@ def _refitted(identification: Identification) -> dict[str, float]:
 
 
 def _of_delay(delay: DelayResult) -> str:
-    """Return what decides about the delay, for the pictures that are drawn."""
+    """Describe how the delay was found."""
     parts = []
     step = delay.step
     if step is not None and step.repeats:
         parts.append(
-            'Steps tell the first sample that exceeds the noise threshold together with the next '
-            'one, both in the direction in which the averaged response goes on.'
+            'Delay of the steps: the first of two samples in a row above the noise threshold, in '
+            'the direction of the averaged response.'
         )
     if delay.loss is not None:
         parts.append('The loss of least squares, where it tells, rises behind the delay.')

@@ -43,7 +43,7 @@ AXES = {
 
 
 def differ(residuals: Sequence[Residual]) -> bool:
-    """Return whether the refined model is neither the one given nor the same with H refitted."""
+    """Whether the refined model differs from the given model by more than a refitted H."""
     return not any(
         all(np.array_equal(getattr(r, name), r.after) for r in residuals)
         for name in ('given', 'before')
@@ -122,7 +122,7 @@ def _shade(axes: Sequence[Axes], piece: Piece) -> None:
 def _both(
     before: ResidualAnalysis, after: ResidualAnalysis | None
 ) -> list[tuple[ResidualAnalysis, str, str]]:
-    """Return what is compared, with colours and names."""
+    """List the compared analyses with colours and names."""
     if after is None:
         return [(before, style.VERMILION, 'residual')]
     return [(before, style.VERMILION, 'before'), (after, style.BLUE, 'after')]

@@ -5,7 +5,7 @@
 The looks of the pictures: colours, fonts, axes, and long traces without loss of their extremes.
 
 Every setting is one of a figure: pyplot and the global settings stay as they are.  Pictures can
-be drawn from any thread, and beside those of a lab.
+be drawn from any thread, and beside other pictures of a lab.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
 GREEN, ORANGE, PURPLE = '#009E73', '#E69F00', '#CC79A7'
 GREY, ZERO = '#7A7A7A', '#555555'
 
-#: who is drawn how, in every picture; 'under' is the measured trace below that of the model
+#: colour of each trace in every picture; 'under' is the measured trace below the model's
 COLOURS = {
     'measured': BLACK,
     'under': '#B0B0B0',
@@ -48,7 +48,7 @@ POINTS = 3000
 DPI = 160
 #: an axis ends at this many times the usual error, if the largest one is this much further out
 USUAL, ROOM, FAR = 0.995, 2.5, 1.6
-#: largest error, in the unit of its axis, that is that of floating-point numbers
+#: largest error, in the unit of its axis, that floating-point numbers explain
 ROUNDING = 1e-6
 
 
@@ -58,7 +58,7 @@ class NothingToDraw(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A drawn picture; the name is that of a file without its ending."""
+    """A drawn picture; its name is the file name without the ending."""
 
     name: str
     title: str
@@ -66,7 +66,7 @@ class Picture:
     figure: Figure
 
 
-#: name, title and caption of a picture, and what draws it
+#: name, title and caption of a picture, and the function that draws it
 Wanted = tuple[str, str, str, Callable[[], Figure]]
 
 
@@ -98,7 +98,7 @@ def png(picture: Figure, dpi: int | None = None) -> bytes:
 
 
 def safe(text: str, longest: int = 60) -> str:
-    """Return text that shows as it is: no mathematics, no control characters, not too long."""
+    """Escape mathematics and control characters in a text, and shorten it."""
     shown = ''.join(c if c.isprintable() else '?' for c in text)
     if len(shown) > longest:
         shown = shown[: longest - 3] + '...'
@@ -111,7 +111,7 @@ def figure(height: float, width: float = WIDTH) -> Figure:
 
 
 def tidy(axes: Axes, xlabel: str = '', ylabel: str = '', title: str = '') -> Axes:
-    """Label an axes and take away what carries no information."""
+    """Label an axes, and remove the spines at the top and at the right."""
     axes.set_xlabel(xlabel, fontsize=NORMAL)
     axes.set_ylabel(ylabel, fontsize=NORMAL)
     if title:
@@ -158,7 +158,7 @@ def envelope(y: Array, points: int = POINTS) -> Integers:
     """
     Return the samples that show every extreme of a trace: about `points`, or all of a short one.
 
-    Of a long trace these are the smallest and the largest of each stretch; one of NaN alone keeps
+    A long trace keeps the smallest and the largest sample of each stretch.  A stretch of NaN keeps
     a NaN, which breaks the line.
     """
     if y.size <= points:

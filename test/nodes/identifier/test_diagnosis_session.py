@@ -15,7 +15,7 @@ from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome, records_of_runs
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.report.to_json import json_text
+from piezo_ident.report.json_data import json_text
 from programs import slow_model
 import pytest
 

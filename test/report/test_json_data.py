@@ -12,7 +12,7 @@ import jsonschema
 import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import Errors, FORMULA, FoundParameter
-from piezo_ident.report.to_json import diagnosis_schema, json_text, to_json
+from piezo_ident.report.json_data import diagnosis_schema, json_text, to_json
 import pytest
 
 VERDICTS = ('named', 'class', 'partly_explained', 'refitted', 'unexplained', 'none')

@@ -21,6 +21,7 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.html import Step
 from piezo_ident.report.table import listed, number
 from scipy.signal import correlate
 
@@ -28,7 +29,7 @@ from scipy.signal import correlate
 ENOUGH = 2.0
 #: the programs of the experiments
 PROGRAMS: dict[Kind, str] = {'sweeps': 'diagnosis', 'holds': 'holds'}
-#: what a lab records next; the name stands for a file that is not there yet
+#: name of a record that the lab still has to make
 OTHER = 'other.csv'
 #: a voltage is compared with a program by means over so long [s], which must correlate so well
 COARSE, SAME = 0.01, 0.98
@@ -65,20 +66,12 @@ class Prompt:
         return shlex.join(['piezo_ident', verb, *words, *(self.reading if reads else ())])
 
 
-@dataclass(frozen=True)
-class Step:
-    """Why to do something, and the command that does it."""
-
-    reason: str
-    command: str
-
-
 def next_steps(
     result: Identification | Diagnosis | EachAxis[Identification] | EachAxis[Diagnosis],
     prompt: Prompt,
 ) -> list[Step]:
     """
-    Return what to do after an identification or a diagnosis.
+    Suggest the next steps after an identification or a diagnosis.
 
     Parameters
     ----------
@@ -100,8 +93,7 @@ def _after_axes(is_diagnosed: bool, prompt: Prompt) -> Step:
             prompt.command('predict', prompt.model, OTHER),
         )
     return Step(
-        'find the paths between the axes, and what else the model lacks, on a record in which all '
-        'axes move',
+        'find the paths between the axes, and missing effects, on a record in which all axes move',
         prompt.command('diagnose', prompt.model, OTHER, '--model', 'refined.yaml'),
     )
 
@@ -118,7 +110,7 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
         others = {row.record for row in result.errors if row.data == 'validation'}
         names = [record.name for record in result.records if record.name not in others]
         yield Step(
-            'the number of thresholds was given; the data may choose a better one',
+            'the number of thresholds was given; the data may choose a better number',
             prompt.command(
                 *('identify', *prompt.files(names), '--thresholds', 'auto'),
                 *('--model', prompt.model, '--overwrite'),
@@ -131,8 +123,7 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
         yield _use(f'the error is {number(times, 2)} times the sensor noise', prompt, prompt.model)
         return
     yield Step(
-        'find out what the model lacks'
-        + ('' if is_validated else ', on a record that was not fitted'),
+        'find missing effects' + ('' if is_validated else ', on a record that was not fitted'),
         prompt.command(
             *('diagnose', prompt.model),
             *(prompt.files(errors.records) if is_validated else [OTHER]),
@@ -160,7 +151,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
         )
     is_changed = bool(result.changes)
     if result.verdict == 'none' and not is_changed:
-        yield _use('the model lacks nothing that these data show', prompt, prompt.given)
+        yield _use('these data show no missing effect', prompt, prompt.given)
     elif not result.unseen and is_changed:
         yield Step(
             'check the refined model on a record that took no part',
@@ -169,7 +160,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
 
 
 def _plays(record: Record, name: str) -> bool:
-    """Return whether the voltage of a record is that of a shipped program, of any range."""
+    """Whether the voltage of a record follows a shipped program, scaled to any range."""
     program = Program.load(name)
     return any(_is_played(program, piece) for piece in record)
 
@@ -179,7 +170,7 @@ def _is_played(program: Program, piece: Piece) -> bool:
     rate = min(piece.sample_rate, 2000.0)
     built = scaled(program, program.limits, rate).build()
     wanted, v = _means(built.v, rate), _means(piece.v, piece.sample_rate)
-    # what was cut off at the ends is rest
+    # the ends, which may be cut off, are rest
     wanted = wanted[wanted.size // 10 : -(wanted.size // 10)]
     if v.size < wanted.size:
         return False
@@ -200,8 +191,7 @@ def _means(v: Array, rate: float) -> Array:
 
 def _experiment(reason: str, program: str, model: StageModel, prompt: Prompt) -> Step:
     low, high = model.scaling.range
-    # noise at the ends of a measured voltage may exceed the range of the amplifier; rounding
-    # changes the ends by less than an extrapolation
+    # rounded, because noise at the ends of a measured voltage may exceed the amplifier's range
     digits = -math.floor(math.log10(1.5e-3 * (high - low)))
     ends = [f'{round(end, digits) + 0.0:.12g}' for end in (low, high)]
     return Step(

@@ -15,19 +15,23 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from piezo_ident import __version__
-from piezo_ident.diagnosis.results import Diagnosis, Errors, FORMULA, FoundParameter
-from piezo_ident.identification.results import DelayResult, DynamicsResult, Identification, Steps
 from piezo_ident.model import metrics
 from piezo_ident.model.files import finite, plain
-from piezo_ident.model.free_run import FreeRun, PieceRun
+from piezo_ident.model.free_run import FreeRun, FreeRunErrors, PieceRun
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
-from piezo_ident.report.identification import headline
 
 if TYPE_CHECKING:
     from piezo_ident.control.inverse import Inverse
+    from piezo_ident.diagnosis.results import Diagnosis, Errors, FoundParameter
+    from piezo_ident.identification.results import (
+        DelayResult,
+        DynamicsResult,
+        Identification,
+        Steps,
+    )
 
     One = Identification | Diagnosis | FreeRun | Inverse | Record
     Shown = One | EachAxis[Identification] | EachAxis[Diagnosis] | EachAxis[FreeRun]
@@ -52,61 +56,78 @@ def to_json(
     Returns
     -------
     dict
-        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  Numbers that are unknown
-        or infinite are None, with two exceptions: an infinite parameter of an effect is the text
-        ``inf`` or ``-inf``, and the overall error of a model that diverged is the largest float64.
+        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  An unknown or infinite
+        number is None.  Two numbers differ: an infinite parameter of an effect is the text ``inf``
+        or ``-inf``, and the overall error of a diverged model is the largest float64.
     """
     if isinstance(result, EachAxis):
         return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
-    if isinstance(result, Diagnosis):
-        data = _diagnosis(result)
-    elif isinstance(result, Identification):
-        data = _identified(result, runs)
-    else:
-        data = _numbers(result)
-    return dict(finite(plain({**VERSION, **data})))
+    return dict(finite(plain({**VERSION, **_data(result, runs)})))
 
 
-def _numbers(result: FreeRun | Inverse | Record) -> dict[str, Any]:
-    """Numbers and texts of a result over time, without its samples."""
+def _data(result: One, runs: Sequence[PieceRun]) -> dict[str, Any]:
     if isinstance(result, Record):
-        return {
-            'record': result.name,
-            'samples': result.n,
-            'duration': result.duration,
-            'sample_rates': list(dict.fromkeys(piece.sample_rate for piece in result)),
-            'voltage_range': list(result.voltage_range),
-            'stroke': result.stroke if result.is_measured else None,
-            'segments': list(result.labels),
-            'data_faults': _faults([result]),
-        }
+        return _record(result)
     if isinstance(result, FreeRun):
-        late = result.errors_after_start
-        return {
-            'record': result.record.name,
-            'errors': {
-                'unit': '% of stroke',
-                'formula': metrics.FORMULA,
-                'whole_record': asdict(result.errors),
-                'start_forgotten': None if late is None else asdict(late),
-            },
-            'estimated_starts': sum(result.estimated),
-            'warnings': list(result.warnings),
-        }
+        return _free_run(result)
+    from piezo_ident.control.inverse import Inverse
+
+    if isinstance(result, Inverse):
+        return _drive(result)
+    from piezo_ident.diagnosis.results import Diagnosis
+
+    return _diagnosis(result) if isinstance(result, Diagnosis) else _identified(result, runs)
+
+
+def _record(record: Record) -> dict[str, Any]:
     return {
+        'record': record.name,
+        'pieces': len(record.pieces),
+        'samples': record.n,
+        'duration': record.duration,
+        'sample_rates': list(dict.fromkeys(piece.sample_rate for piece in record)),
+        'voltage_range': list(record.voltage_range),
+        'stroke': record.stroke if record.is_measured else None,
+        'labels': list(record.labels),
+        'faults': [asdict(fault) for fault in record.faults],
+    }
+
+
+def _free_run(run: FreeRun) -> dict[str, Any]:
+    late = run.errors_after_start
+    return {
+        'record': run.record.name,
+        'formula': metrics.FORMULA,
+        'whole': _free_run_errors(run.errors),
+        'start_forgotten': None if late is None else _free_run_errors(late),
+        'memory_estimated': list(run.estimated),
+        'warnings': list(run.warnings),
+    }
+
+
+def _drive(result: Inverse) -> dict[str, Any]:
+    return {
+        'formula': metrics.FORMULA,
+        'percent_of_stroke': result.error,
+        'expected_percent_of_stroke': result.expected,
+        'expected_rms': result.expected_rms,
+        'expected_offset': result.expected_offset,
         'samples': result.v.size,
         'lead': result.lead,
+        'clipped': int(result.clipped.sum()),
         'voltage_range': [result.v.min(), result.v.max()],
-        'errors': {
-            'unit': '% of stroke',
-            'formula': metrics.FORMULA,
-            'inversion': result.error,
-            'expected': result.expected,
-            'expected_rms': result.expected_rms,
-            'expected_offset': result.expected_offset,
-        },
-        'out_of_reach': int(result.clipped.sum()),
+        'steepest': np.abs(np.diff(result.v) / np.diff(result.t)).max(initial=0.0),
         'warnings': list(result.warnings),
+    }
+
+
+def _free_run_errors(errors: FreeRunErrors) -> dict[str, Any]:
+    return {
+        'percent_of_stroke': errors.percent,
+        'fit_percent': errors.fit,
+        'n': errors.n,
+        'offset': errors.offset,
+        'percent_of_stroke_without_offset': errors.percent_without_offset,
     }
 
 
@@ -143,6 +164,8 @@ def steps_to_json(steps: Steps, sample_rate: float, records: Sequence[Record]) -
 
 
 def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, Any]:
+    from piezo_ident.report.identification import headline
+
     model, fit, dynamics = result.model, result.hysteresis, result.dynamics
     h, m = model.hysteresis, model.hysteresis.thresholds.size
     std = fit.std if fit.std.size == m + 2 else np.full(m + 2, np.nan)
@@ -234,6 +257,8 @@ def _faults(records: Sequence[Record]) -> list[dict[str, Any]]:
 
 
 def _diagnosis(result: Diagnosis) -> dict[str, Any]:
+    from piezo_ident.diagnosis.results import FORMULA
+
     group, left = result.group, result.unexplained
     return {
         'verdict': result.verdict,
@@ -305,7 +330,7 @@ def _parameter(parameter: FoundParameter) -> dict[str, Any]:
 
 
 def _value(value: Any) -> Any:
-    # the end of a range that is not there is infinite, which is not the same as unknown
+    # a range without an end has an infinite end, while None means unknown
     if isinstance(value, list):
         return [_value(x) for x in value]
     if isinstance(value, float) and math.isinf(value):
