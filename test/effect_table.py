@@ -36,6 +36,16 @@ VISIBLE = {
     'even_nonlinearity': {'square': 0.01, 'fourth': -0.004},
     'gain_drift': {'time': [0.0, 0.05, 0.2], 'gain': [0.0, 0.01, -0.02]},
     'input_feedthrough': {'gain': 0.003, 'rate_gain': 1e-6},
+    'loop_hysteresis': {
+        'frequency': 400.0,
+        'damping': 0.05,
+        'elastic': -0.1,
+        'viscous': -0.02,
+        'stiffness': [0.2, 0.1],
+        'threshold': [0.0, 0.05],
+        'gamma': [0.8, 0.0],
+        'delta': [-1.1, 0.0],
+    },
     'noncongruent_minor_loops': {'threshold': [0.03, 0.2], 'slope': [0.04, -0.02], 'bias': 0.4},
     'periodic_disturbance': {
         'frequency': 50.0,
@@ -66,7 +76,7 @@ VIEW = View(
     channels={'other_axis': (0.25, 0.5)},
     lines=(50.0, 150.0),
     modes=tuple((m.frequency, m.damping) for m in PAPER.dynamics.modes(FS)),
-    max_frequency=120.0,
+    max_frequency=2000.0,
     thresholds=H.thresholds,
 )
 

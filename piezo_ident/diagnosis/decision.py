@@ -190,6 +190,9 @@ class Candidates:
             changes = change_g(tuple(set(effects) - set(part)))
             if changes and self.rows.percent(before - left) < self.missed:
                 return False
+        others = map(self.best, _narrower(effects))
+        if any(left > TAKES * self.left(other) for other in others if other is not None):
+            return False
         return _beyond_chance(best)
 
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
@@ -325,6 +328,8 @@ def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...],
     for other in candidates.sets:
         if len(other) != len(best.effects) or other == best.effects:
             continue
+        if best.effects in _narrower(other):
+            continue
         rival = candidates.best(other, best.effects)
         if rival is not None and candidates.left(rival) <= most:
             found.append(other)
@@ -340,6 +345,13 @@ def _parts(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
     """Yield all smaller sets of the same effects."""
     for k in range(len(effects)):
         yield from itertools.combinations(effects, k)
+
+
+def _narrower(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    """Yield the sets with an effect in the place of one that contains it."""
+    for name in effects:
+        for other in find_effect(name).contains:
+            yield tuple(sorted({*effects, other} - {name}))
 
 
 def _beyond_chance(candidate: Candidate) -> bool:

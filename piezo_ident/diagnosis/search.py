@@ -141,7 +141,8 @@ def search_round(
     promising.sort(key=lambda scores: scores[0].error)
     chosen = promising[:JOINT_FITS]
     # a small step does not separate an effect from its look-alikes, so these are fitted, too
-    alike = look_alikes(chosen[0][0].effect.name) if chosen else ()
+    first = chosen[0][0].effect if chosen else None
+    alike = (*look_alikes(first.name), *first.contains) if first else ()
     chosen += [scores for scores in promising[JOINT_FITS:] if scores[0].effect.name in alike]
     starts = [
         (

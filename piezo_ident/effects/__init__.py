@@ -32,6 +32,7 @@ from piezo_ident.effects.effect import Effect, Parameter
 from piezo_ident.effects.even_nonlinearity import EvenNonlinearity
 from piezo_ident.effects.gain_drift import GainDrift
 from piezo_ident.effects.input_feedthrough import InputFeedthrough
+from piezo_ident.effects.loop_hysteresis import LoopHysteresis
 from piezo_ident.effects.noncongruent_minor_loops import NoncongruentMinorLoops
 from piezo_ident.effects.periodic_disturbance import PeriodicDisturbance
 from piezo_ident.effects.preload_loss import PreloadLoss
@@ -54,6 +55,7 @@ _OWN: tuple[type[Effect], ...] = (
     EvenNonlinearity,
     GainDrift,
     InputFeedthrough,
+    LoopHysteresis,
     NoncongruentMinorLoops,
     PeriodicDisturbance,
     PreloadLoss,

@@ -156,6 +156,8 @@ class Effect:
         of H: ``not``, ``linear`` or ``bent`` (nonlinear).
     in_delay_line : bool
         Whether the effect changes the delay of the model, by `added_delay`, instead of the signal.
+    contains : tuple of str
+        Effects that are special cases of this one, which must clearly err more than this one.
 
     Parameters
     ----------
@@ -186,6 +188,7 @@ class Effect:
     change: ClassVar[Literal['passed', 'filtered', 'scaled', 'curved', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
+    contains: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,

@@ -1,0 +1,310 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Hysteresis inside the loop: the spring of a mode is hysteretic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ModelError
+from piezo_ident.common.kernel import alive, ordered_kernel, part_of_kernels
+from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
+from piezo_ident.effects.second_order import slope_of_mode
+from piezo_ident.operators.c_code import CCode, Numbers
+from piezo_ident.operators.chain import Block
+from scipy.linalg import expm
+
+#: repetitions of a sub-step; each lowers the error by the square of its phase over six
+REPEATED = 3
+#: phase of a mode in a sub-step [rad] (physics: a twentieth of a radian integrates a loop to 1e-3)
+PHASE = 0.05
+#: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
+RESONATES = math.sqrt(0.5)
+#: laws that are tried: shares of the stiffness that slip over the swing, and half widths of plays
+#: as shares of the swing (taste: they span a decade, and a fit moves what it needs)
+SLIPS, WIDTHS = (1.0, 10.0), (0.03, 0.1, 0.3)
+
+
+@part_of_kernels
+def _slipped(s: float, way: float, gamma: float, delta: float, power: float) -> float:
+    # the law of Bouc and Wen along a short way, by its midpoint
+    if gamma == 0.0 and delta == 0.0:
+        return s + way
+    side = gamma if way > 0.0 else -gamma
+    half = s
+    for share in (0.5, 1.0):
+        size = abs(half)
+        if power != 1.0:
+            size = size**power
+        half = s + share * way * (1.0 - (delta + (side if half > 0.0 else -side)) * size)
+    return half
+
+
+@ordered_kernel
+def run_loop(
+    x: Array, step: Array, spring: Array, elements: Array, state: Array, memory: Array, out: Array
+) -> None:
+    """
+    Compute the force of the spring at each sample, and carry state and memory on.
+
+    `step` is the sub-step of q and p, each with the inputs at its begin and end.  `spring` holds
+    elastic, viscous, power, and the number of sub-steps.  The rows of `elements` are stiffness,
+    threshold, gamma and delta.  `state` holds the last two inputs, q and p of the linear mode and
+    of the difference, and the force; `memory` the play and the slip of each element.
+    """
+    count = int(spring[3])
+    a, c, power = spring[0], spring[1], spring[2]
+    w1, w2, l0, l1, d0, d1 = state[0], state[1], state[2], state[3], state[4], state[5]
+    h = state[6]
+    new = np.empty_like(memory)
+    for k in range(x.size):
+        w0 = x[k]
+        # the command between samples: a parabola through the last three
+        slope, bend = 0.5 * (3.0 * w0 - 4.0 * w1 + w2), 0.5 * (w0 - 2.0 * w1 + w2)
+        begin = w1
+        for j in range(count):
+            tau = (j + 1.0) / count - 1.0
+            end = w0 + tau * (slope + tau * bend)
+            q_old = l0 + d0
+            m0 = step[0, 0] * l0 + step[0, 1] * l1 + step[0, 2] * begin + step[0, 3] * end
+            m1 = step[1, 0] * l0 + step[1, 1] * l1 + step[1, 2] * begin + step[1, 3] * end
+            e0 = step[0, 0] * d0 + step[0, 1] * d1 - step[0, 2] * h
+            e1 = step[1, 0] * d0 + step[1, 1] * d1 - step[1, 2] * h
+            force = h
+            q = q_old
+            for _ in range(REPEATED):
+                q = m0 + e0 - step[0, 3] * force
+                p = m1 + e1 - step[1, 3] * force
+                force = a * q + c * p
+                for i in range(elements.shape[0]):
+                    r = elements[i, 1]
+                    play = min(max(memory[i, 0], q - r), q + r)
+                    slip = _slipped(
+                        memory[i, 1],
+                        play - memory[i, 0],
+                        elements[i, 2],
+                        elements[i, 3],
+                        power,
+                    )
+                    new[i, 0], new[i, 1] = play, slip
+                    force += elements[i, 0] * slip
+            l0, l1 = alive(m0), alive(m1)
+            d0 = alive(e0 - step[0, 3] * force)
+            d1 = alive(e1 - step[1, 3] * force)
+            h, begin = force, end
+            for i in range(elements.shape[0]):
+                memory[i, 0], memory[i, 1] = new[i, 0], new[i, 1]
+        out[k] = h
+        w2, w1 = w1, w0
+    state[0], state[1], state[2], state[3], state[4], state[5] = w1, w2, l0, l1, d0, d1
+    state[6] = h
+
+
+# the loop of `run_loop` for one sample
+_STEP = """
+{
+    const double w0 = x - s->rest;
+    const double slope = 0.5 * (3.0 * w0 - 4.0 * s->w1 + s->w2);
+    const double bend = 0.5 * (w0 - 2.0 * s->w1 + s->w2);
+    double play[COUNT], slip[COUNT], begin = s->w1;
+    int i, j, k, m;
+    for (j = 0; j < count; j++) {
+        const double tau = (j + 1.0) / count - 1.0;
+        const double end = w0 + tau * (slope + tau * bend);
+        const double *const l = s->l, *const d = s->d;
+        const double m0 = to_q[0] * l[0] + to_q[1] * l[1] + to_q[2] * begin + to_q[3] * end;
+        const double m1 = to_p[0] * l[0] + to_p[1] * l[1] + to_p[2] * begin + to_p[3] * end;
+        const double e0 = to_q[0] * d[0] + to_q[1] * d[1] - to_q[2] * s->h;
+        const double e1 = to_p[0] * d[0] + to_p[1] * d[1] - to_p[2] * s->h;
+        double force = s->h;
+        for (k = 0; k < REPEATED; k++) {
+            const double q = m0 + e0 - to_q[3] * force, p = m1 + e1 - to_p[3] * force;
+            force = elastic * q + viscous * p;
+            for (i = 0; i < n; i++) {
+                double way, half = s->slip[i];
+                play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
+                way = play[i] - s->play[i];
+                if (gamma[i] == 0.0 && delta[i] == 0.0)
+                    half += way;
+                else
+                    for (m = 0; m < 2; m++) {
+                        const double side = way > 0.0 ? gamma[i] : -gamma[i];
+                        const double bent = delta[i] + (half > 0.0 ? side : -side);
+                        half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
+                    }
+                slip[i] = half;
+                force += stiffness[i] * half;
+            }
+        }
+        s->l[0] = piezo_alive(m0);
+        s->l[1] = piezo_alive(m1);
+        s->d[0] = piezo_alive(e0 - to_q[3] * force);
+        s->d[1] = piezo_alive(e1 - to_p[3] * force);
+        s->h = force;
+        begin = end;
+        for (i = 0; i < n; i++) {
+            s->play[i] = play[i];
+            s->slip[i] = slip[i];
+        }
+    }
+    s->w2 = s->w1;
+    s->w1 = w0;
+    x -= s->h;
+}
+"""
+
+
+def mode_step(
+    frequency: float, damping: float, sample_rate: float, stiffest: float
+) -> tuple[Array, int]:
+    """
+    Compute the exact sub-step of a mode, and the number of sub-steps in a sample.
+
+    The sub-step is the argument `step` of `run_loop`.  Raises ModelError if the frequency is not
+    below half the sampling rate.
+    """
+    slope_of_mode(frequency, sample_rate)
+    phase = 2.0 * math.pi * frequency / sample_rate
+    # a power of two, so that a small change of the stiffness does not change the grid
+    count = 2 ** max(0, math.ceil(math.log2(phase * math.sqrt(stiffest) / PHASE)))
+    h = phase / count
+    # q' = p, p' = x - q - 2 zeta p in units of phase, and x moves along a line
+    motion = np.zeros((4, 4))
+    motion[0, 1], motion[1, :3], motion[2, 3] = h, (-h, -2.0 * damping * h, h), 1.0
+    E = expm(motion)
+    return np.ascontiguousarray(np.column_stack([E[:2, :2], E[:2, 2] - E[:2, 3], E[:2, 3]])), count
+
+
+class LoopHysteresis(Effect):
+    """
+    A mode whose spring is hysteretic.
+
+    The force of the spring acts back on the motion that causes it, so the effect lies inside the
+    loop of the mechanics and changes stiffness and damping with the amplitude.  H, in front of the
+    mechanics, cannot do this.  With q the deflection of the mode of G at w = 2 pi frequency, from
+    the position at rest:
+
+        q'' + 2 zeta w q' + w^2 q = w^2 (x - h),    h = elastic q + viscous q' / w + sum_i k_i s_i,
+        s_i' = e_i' - gamma_i |e_i'| |s_i|^(n-1) s_i - delta_i e_i' |s_i|^n,
+
+    and e_i is the output of a play of half width r_i that q drives.  The signal behind the effect
+    is x - h, and G remains the linear part.  An element with r = 0 is the law of Bouc and Wen, and
+    a lag along the path (Dahl) if delta = 0, too.  With gamma = delta = 0 it is a play.
+    `elastic` and `viscous` return to G what G had absorbed of the mean stiffness and damping.
+
+    Notes
+    -----
+    The linear part of a sub-step is exact; the force is found by repetition.  The command between
+    samples is a parabola through the last three.  Y. K. Wen, "Method for random vibration of
+    hysteretic systems", J. Eng. Mech. Div. 102(2), 1976, pp. 249-263.  J. P. Noel, M. Schoukens,
+    "Hysteretic benchmark with a dynamic nonlinearity", 2016, doi:10.4121/12967592.
+    """
+
+    name = 'loop_hysteresis'
+    slot = 'hidden'
+    # elastic and viscous alone are a linear change of the mode
+    contains = ('amplifier_lag', 'changed_dynamics', 'delay_change', 'input_feedthrough')
+    description = (
+        'hysteresis in the spring of a mode; its frequency and damping change with the amplitude, '
+        'by 1 .. 50 %'
+    )
+    needs = 'a multisine or a sweep across the resonance, at two amplitudes'
+    parameters = (
+        Parameter('frequency', 'Hz', 'frequency of the mode in G', NAN, 1e-3, 1e6, scale='fixed'),
+        Parameter('damping', '1', 'damping ratio of the mode in G', NAN, 1e-5, 1.0, scale='fixed'),
+        Parameter('elastic', '1', 'change of the stiffness', 0.0, -0.99, 3.0, step=1e-3),
+        Parameter('viscous', '1', 'change of the damping 2 zeta', 0.0, -2.0, 2.0, step=1e-3),
+        Parameter('stiffness', '1', 'stiffness k_i', 0.0, -3.0, 3.0, vector=True, step=1e-3),
+        Parameter('threshold', 'span', 'half width r_i', NAN, 0.0, 10.0, True, 0.0, scale='fixed'),
+        Parameter('gamma', 'span^-n', 'gamma_i', NAN, -1e3, 1e3, vector=True, default=0.0),
+        Parameter('delta', 'span^-n', 'delta_i', NAN, -1e3, 1e3, vector=True, default=0.0),
+        Parameter('power', '1', 'power n', NAN, 0.5, 4.0, default=1.0, scale='fixed'),
+    )
+
+    def prepare(self) -> None:
+        """Compute the sub-step."""
+        self._silent = self.is_neutral(self.values)
+        rows = [self.array(name) for name in ('stiffness', 'threshold', 'gamma', 'delta')]
+        self._elements = np.ascontiguousarray(np.array(rows).T)
+        stiffest = 1.0 + abs(self.number('elastic')) + float(np.abs(rows[0]).sum())
+        frequency, damping = self.number('frequency'), self.number('damping')
+        self._step, count = mode_step(frequency, damping, self.sample_rate, stiffest)
+        spring = [self.number(name) for name in ('elastic', 'viscous', 'power')]
+        self._spring = np.array([*spring, count])
+
+    @classmethod
+    def agree(cls, values: Mapping[str, Value]) -> None:
+        """Refuse lists of different lengths, and a spring without stiffness."""
+        super().agree(values)
+        left = 1.0 + float(values['elastic']) + float(np.sum(values['stiffness']))
+        if left <= 0.0:
+            raise ModelError(
+                f'effect {cls.name}: elastic and stiffness add up to {left - 1.0:g}, which leaves '
+                'the mode no stiffness; their sum must stay above -1'
+            )
+
+    @classmethod
+    def trials(cls, view: View) -> tuple[Trial, ...]:
+        """
+        List laws in the lowest mode that the data excite.
+
+        A spring shows where its mode resonates: the deflection is then larger than the command.
+        """
+        excited = [m for m in view.modes if m[0] <= view.max_frequency and m[1] < RESONATES]
+        if not excited:
+            return ()
+        frequency, damping = min(excited)
+        mode = {'frequency': frequency, 'damping': damping}
+        swing = view.span / (2.0 * damping)
+        wide = np.array(WIDTHS) * swing
+        laws = [{'gamma': [g / swing], 'stiffness': [0.0]} for g in SLIPS]
+        laws.append({'threshold': wide, 'stiffness': np.zeros(wide.size)})
+        return tuple(cls.trial({**mode, **law}) for law in laws)
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Come to rest: the spring is relaxed, and the signal passes."""
+        self._rest = x0
+        self._state, self._memory = np.zeros(7), np.zeros((self._elements.shape[0], 2))
+        return x0
+
+    def process(self, block: Block) -> Block:
+        """Subtract the force of the spring."""
+        if self._silent:
+            return block
+        out = np.empty(block.x.size)
+        x = block.x - self._rest
+        run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, out)
+        return block.with_signal(block.x - out)
+
+    def c_code(self) -> CCode:
+        """Write the effect in C."""
+        if self._silent:
+            return CCode()
+        elastic, viscous, power, count = self._spring.tolist()
+        names = ('stiffness', 'threshold', 'gamma', 'delta')
+        n = self._elements.shape[0]
+        numbers: Numbers = {'n': n, 'count': int(count), 'to_q': self._step[0]}
+        numbers |= {'to_p': self._step[1], 'elastic': elastic, 'viscous': viscous, 'power': power}
+        numbers |= dict(zip(names, self._elements.T, strict=True))
+        size = 'fabs(half)' if power == 1.0 else 'pow(fabs(half), power)'
+        return CCode(
+            numbers,
+            f'double rest, w1, w2, l[2], d[2], h, play[{n}], slip[{n}];\n',
+            """
+{
+    int i;
+    s->rest = x;
+    s->w1 = s->w2 = s->h = 0.0;
+    s->l[0] = s->l[1] = s->d[0] = s->d[1] = 0.0;
+    for (i = 0; i < n; i++)
+        s->play[i] = s->slip[i] = 0.0;
+}
+""",
+            _STEP.replace('SIZE', size)
+            .replace('COUNT', str(n))
+            .replace('REPEATED', str(REPEATED)),
+        )
