@@ -68,6 +68,16 @@ def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
     return new
 
 
+def line_between(before: float, after: float, missing: int) -> Array:
+    """
+    Return the missing numbers on the straight line between two numbers.
+
+    >>> line_between(1.0, 4.0, 2)
+    array([2., 3.])
+    """
+    return before + (after - before) * (np.arange(1, missing + 1) / (missing + 1))
+
+
 def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
     Return the smallest and largest of measured numbers, but for wild ones.

@@ -93,13 +93,13 @@ def _changes(model: StageModel, kind: Learns) -> Iterator[Change]:
         nodes = np.linspace(r[0], r[-1], min(HATS, r.size))
         for k, hat in enumerate(np.eye(nodes.size)):
             share = np.interp(r, nodes, hat) if nodes.size > 1 else np.ones(1)
-            yield Change(f'weights_{k}', replace(model, hysteresis=_grown(h, share)), WEIGHTS)
+            yield Change(f'weights_{k}', replace(model, hysteresis=grown(h, share)), WEIGHTS)
     yield Change('cubic', replace(model, hysteresis=replace(h, p1=h.p1 + 1.0)), CUBIC)
     if any(e.name == Creep.name for e in model.effects):
         yield Change('creep', _creeping(model, 2.0), CREEP)
 
 
-def _grown(h: Hysteresis, share: Array) -> Hysteresis:
+def grown(h: Hysteresis, share: Array) -> Hysteresis:
     """Increase the weights of the plays of H by a share each, with their curves and bias."""
     more = 1.0 + share
     return replace(
@@ -229,7 +229,7 @@ class Adaptation:
         gain, h = 1.0 + changes['gain'], model.hysteresis
         share = self._weights(changes)
         if share is not None:
-            h = _grown(h, share / gain)
+            h = grown(h, share / gain)
         h = h.scaled(gain)
         h = replace(h, p1=h.p1 + changes.get('cubic', 0.0))
         if 'creep' in changes:

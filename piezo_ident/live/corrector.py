@@ -16,15 +16,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array, Integers, line_between
 from piezo_ident.common.errors import DataError
 from piezo_ident.fitting.adaptation import Adaptation, Learns, Recalled
+from piezo_ident.fitting.attribution import Attribution, percent_change, SURE
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.stream import Stream
 from piezo_ident.record.blocks import Samples
 
 #: names of the corrections, with the attribute of `Observed` that holds each
@@ -37,7 +37,12 @@ CORRECTIONS = {
     'estimate/std': 'std',
 }
 #: the same for the gain, if it is followed
-GAIN = {'gain/value': 'gain', 'gain/std': 'gain_std'}
+GAIN = {
+    'gain/value': 'gain',
+    'gain/std': 'gain_std',
+    'gain/drift': 'drift',
+    'gain/drift_std': 'drift_std',
+}
 #: names of the learnt changes of the model
 LEARNT = ('learnt/gain', 'learnt/loop')
 #: corrections published per second of the stream
@@ -47,22 +52,8 @@ RATE = 50.0
 SETTLED = 1e-5
 #: smallest creep from earlier motion that is mentioned, as a share of the span
 FAINT = 1e-4
-#: smallest change of the gain that is mentioned, in standard deviations (taste)
-SURE = 3.0
 #: longest wait for displacement, in time of the stream [s]
 PATIENCE = 0.5
-#: time constant with which a wanted motion takes over a correction; a step would excite the modes
-#: of a stage [s] (taste)
-FADE = 0.01
-#: largest correction of a wanted motion, as a share of the span: a sensor may be at fault (taste)
-MOST = 0.1
-
-
-def gain_change(value: float, std: float) -> str:
-    """Format a change of the gain; empty if it is within `SURE` standard deviations of zero."""
-    if not abs(value) > SURE * std > 0.0:
-        return ''
-    return f'gain {100.0 * value:+.1f} +- {max(100.0 * std, 0.05):.1f} %'
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +114,7 @@ class Corrector:
         self._horizon, self._gain, self._rate, self._adapt = horizon, gain, rate, adapt
         self._model: StageModel | None = None
         self._adaptation: Adaptation | None = None
+        self._attribution: Attribution | None = None
         self._is_new = False
         self.told: dict[str, float] = {}
         self._bin = -1
@@ -158,8 +150,10 @@ class Corrector:
 
     def _learn_anew(self, recalled: Recalled) -> None:
         self._adaptation, self._is_new = None, True
-        if self._model is not None and self._adapt != 'off':
-            self._adaptation = Adaptation(self._model, self._adapt, self._horizon, recalled)
+        if self._model is not None:
+            self._attribution = Attribution(self._model, self._horizon, recalled)
+            if self._adapt != 'off':
+                self._adaptation = Adaptation(self._model, self._adapt, self._horizon, recalled)
         self.told = {}
         self._forget()
 
@@ -182,17 +176,6 @@ class Corrector:
         adaptation.restore()
         return f'the model is as it was given; forgotten: what {seconds:g} s of motion told'
 
-    def ahead(self, lead: int, n: int) -> tuple[Array, float]:
-        """
-        Extrapolate offset plus creep [m], shape (n,), and return the relative change of the gain.
-
-        The first of the n samples comes `lead` samples after the last voltage.
-        """
-        if self._observer is None:
-            return np.zeros(n), 0.0
-        waiting = sum(block.v.size for block in self._waiting)
-        return self._observer.ahead(lead + waiting, n)
-
     def accept(self) -> str:
         """Take the present step of the sensor as its zero; the message gives its size."""
         if self._observer is None:
@@ -202,18 +185,25 @@ class Corrector:
     @property
     def corrected(self) -> str:
         """Sizes of the corrections, as text."""
-        offset, creep, gain, std = (
-            self.told.get(name, 0.0)
-            for name in ('offset/value', 'creep/value', 'gain/value', 'gain/std')
+        offset, creep, gain, std, drift, drift_std = (
+            self.told.get(name, 0.0) for name in ('offset/value', 'creep/value', *GAIN)
         )
         parts = [f'offset {1e6 * offset:+.2g} um']
         if abs(creep) > FAINT * self.span:
             parts.append(f'creep from earlier motion {1e6 * creep:+.2g} um')
-        if said := gain_change(gain, std):
-            parts.append(said)
+        if abs(gain) > SURE * std > 0.0:
+            parts.append(f'gain {percent_change(gain, std)}')
+        if abs(drift) > SURE * drift_std > 0.0:
+            parts.append(f'drift of the gain {100.0 * drift:+.2g} % a second')
         learnt = [(name, self.told.get(name, 0.0)) for name in LEARNT]
         parts += [f'{name.replace("/", " ")} {100.0 * x:+.2g} %' for name, x in learnt if x]
         return ', '.join(parts)
+
+    @property
+    def changed(self) -> str:
+        """What changed of the stage and is not corrected, as text; empty if nothing is clear."""
+        causes = self._attribution.causes if self._attribution is not None else []
+        return ', '.join(str(cause) for cause in causes)
 
     def _forget(self) -> None:
         self._clock = BlockClock()
@@ -249,16 +239,17 @@ class Corrector:
             model = self._model
             if model.is_static:
                 model = replace(model, sample_rate=1.0 / period)
-            if self._adaptation is not None and not self._is_new:
-                self._adaptation.begin()
+            if not self._is_new:
+                self._attribution = Attribution(model, self._horizon)
+                if self._adaptation is not None:
+                    self._adaptation.begin()
             self._is_new = False
             self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
         elif kind is Kind.GAP and self._last is not None:
             # the predictor bridged this gap by a straight line, too
-            share = np.arange(1, missing + 1) / (missing + 1)
-            v0, y0 = self._last
-            y = y0 + (float(prediction.values[0]) - y0) * share
-            self._wait(Samples(np.full(missing, np.nan), y), v0 + (float(v[0]) - v0) * share)
+            ends = zip(self._last, (float(v[0]), float(prediction.values[0])), strict=True)
+            between, y = (line_between(x, now, missing) for x, now in ends)
+            self._wait(Samples(np.full(missing, np.nan), y), between)
         self._wait(prediction, v)
         self._last = float(v[-1]), float(prediction.values[-1])
         return self._estimates()
@@ -308,11 +299,14 @@ class Corrector:
     def _learnt_run(self, block: _Block, y: Array) -> Array:
         """Run the learnt model freely; it learns from displacement y a horizon before."""
         free = block.prediction.values
-        if self._adaptation is None:
-            return free
         ticks = np.arange(block.tick, block.tick + free.size, dtype=np.float64)
         t = self._clock.begin + ticks * self._clock.period
-        return self._adaptation.process(block.v, t, free, y, self._is_settled)
+        if self._adaptation is not None:
+            free = self._adaptation.process(block.v, t, free, y, self._is_settled)
+        if self._attribution is not None:
+            known = y if self._is_settled else np.full(y.size, np.nan)
+            self._attribution.process(block.v, t, free, known)
+        return free
 
     def _tell(self, t: Array, seen: Observed) -> list[dict[str, float]]:
         """Pick the corrections to publish, `rate` times a second of the stream."""
@@ -324,80 +318,3 @@ class Corrector:
         rows = [{n: float(getattr(seen, x)[k]) for n, x in names.items()} | learnt for k in first]
         self._bin, self.told = int(bins[-1]), rows[-1] if rows else self.told
         return rows
-
-
-class Follower:
-    """
-    Corrects a wanted motion by the measured error of the stage.
-
-    A stage differs from its model by an offset, creep and a gain.  The follower subtracts them
-    from the wanted motion before the inverse of the model makes the voltage.
-
-    Parameters
-    ----------
-    model : StageModel
-    gain : bool
-        Whether the gain is followed, too.
-    step : float
-        Largest change of the correction from one sample to the next [m].
-    stream : Stream, optional
-        A run of the model up to now; at rest when absent.
-    known : bool, optional
-        Whether that run has the memory of the plays.
-
-    Attributes
-    ----------
-    corrector : Corrector
-    is_limited : bool
-        Whether the last correction was as large as it may be.
-    """
-
-    def __init__(
-        self,
-        model: StageModel,
-        gain: bool,
-        step: float,
-        stream: Stream | None = None,
-        known: bool = False,
-    ) -> None:
-        self.corrector, self._model, self._step = Corrector(gain=gain), model, step
-        self.corrector.set_model(model)
-        self._stream, self._known = stream or model.stream(), known
-        self._newest = -np.inf
-        # the offset [m] and the gain that are corrected now
-        self._offset = self._gain = 0.0
-        self.is_limited = False
-
-    def drove(self, t: Array, v: Array) -> None:
-        """Take the voltage [V] that was sent, with its time [s]; at least one sample."""
-        self._newest = float(t[-1])
-        prediction = Samples(t, self._stream.process(v, t))
-        self.corrector.predicted(prediction, Samples(t, v), self._known)
-
-    def measured(self, samples: Samples) -> None:
-        """Take a block of displacement; NaN and samples ahead of the voltage are ignored."""
-        usable = np.isfinite(samples.values) & (samples.t <= self._newest)
-        if usable.any():
-            self.corrector.measured(samples.t[usable], samples.values[usable])
-
-    def process(self, wanted: Array, lead: int) -> Array:
-        """
-        Correct the next samples of a wanted motion [m]; shapes (n,).
-
-        The first sample is wanted `lead` samples after the last voltage.
-        """
-        n, s = wanted.size, self._model.scaling
-        offset, gain = self.corrector.ahead(lead + n - 1, 1)
-        share = 1.0 - np.exp(-n / (FADE * self._model.sample_rate))
-        most = n * self._step
-        way = float(np.clip(share * (offset[0] - self._offset), -most, most))
-        most /= abs(s.Y)
-        turn = float(np.clip(share * (np.clip(gain, -MOST, MOST) - self._gain), -most, most))
-        part = np.arange(1, n + 1) / n
-        add = self._offset + way * part
-        gains = self._gain + turn * part
-        self._offset, self._gain = self._offset + way, self._gain + turn
-        change = (wanted - s.y0 - add) / (1.0 + gains) + s.y0 - wanted
-        limit = MOST * abs(s.Y)
-        self.is_limited = bool(np.abs(change).max() > limit)
-        return wanted + np.clip(change, -limit, limit)

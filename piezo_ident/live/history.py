@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import line_between
 from piezo_ident.common.kernel import kernel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
@@ -127,9 +128,9 @@ class TurningPoints:
                 t, v = t[t > end], v[t > end]
                 missing = min(float(t[0]) - end, APPROACH) / period
                 if missing > 1.5:
-                    share = np.linspace(0.0, 1.0, round(missing), endpoint=False)[1:]
-                    parts_t.append(end + (t[0] - end) * share)
-                    parts_v.append(level + (v[0] - level) * share)
+                    n = round(missing) - 1
+                    parts_t.append(line_between(end, float(t[0]), n))
+                    parts_v.append(line_between(level, float(v[0]), n))
             parts_t.append(t)
             parts_v.append(v)
         return np.concatenate(parts_t), np.concatenate(parts_v)

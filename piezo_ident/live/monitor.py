@@ -14,7 +14,6 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.sample_clock import Kind
 from piezo_ident.model.metrics import percent
-from piezo_ident.model.observer import PATH
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.readings.faults import MAX_WILD
 from piezo_ident.record.readings.jumps import AROUND, least_step, wild_readings
@@ -27,8 +26,6 @@ CATCH_UP = 1.0
 MOST = 500
 #: number of bins by which a late quantity may hold up the others
 LAG = 25
-#: share of the mean square of the residual that a wrong gain must explain to be reported (taste)
-EXPLAINED = 0.5
 #: samples on either side that decide whether a reading is wild
 EDGE = AROUND + 4
 
@@ -265,7 +262,7 @@ class TrackingError:
 
 class LiveError:
     """
-    Mean and rms of the residual over a window of sample time [s], and its slope.
+    Mean and rms of the residual over a window of sample time [s].
 
     Wild readings are left out if they are few, by the rule for records.
     """
@@ -323,12 +320,11 @@ class LiveError:
             first = max(0, end - EDGE)
             self._last, self._judged = x[:, first:], end - first
             e = e[begin:end]
-            y = y[begin:end]
-        kept, out = (_sums_of(e[w], (y - e)[w]) for w in (~wild, wild))
+        kept, out = (_sums_of(e[w]) for w in (~wild, wild))
         return kept, out
 
     def _sums(self) -> tuple[Array, int]:
-        sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 7).sum(axis=0)
+        sums = np.array([part[2:] for part in self._parts]).reshape(-1, 2, 3).sum(axis=0)
         kept, out = sums[0], sums[1]
         # frequent wild readings are real motion of the stage
         if out[0] > MAX_WILD * (kept[0] + out[0]):
@@ -348,50 +344,16 @@ class LiveError:
     @property
     def mean(self) -> float:
         """Mean [m]; NaN before the first sample."""
-        (n, total, *_), _ = self._sums()
+        (n, total, _), _ = self._sums()
         return float(total / n) if n else float('nan')
 
     @property
     def rms(self) -> float:
         """Root mean square [m]; NaN before the first sample."""
-        (n, _, square, *_), _ = self._sums()
+        (n, _, square), _ = self._sums()
         return float(np.sqrt(square / n)) if n else float('nan')
 
-    def gain(self, span: float) -> tuple[float, float]:
-        """
-        Fit the slope of the residual over the prediction; return it with its standard deviation.
 
-        Least squares fit the slope and a mean.  The remaining error is correlated along the path
-        of the displacement over a length of `PATH` spans.  A path of twice this length counts as
-        one independent value.
-
-        Parameters
-        ----------
-        span : float
-            Displacement of the model over its range [m].
-
-        Returns
-        -------
-        tuple of float
-            Slope and standard deviation.  The standard deviation is infinite if the slope explains
-            less than `EXPLAINED` of the residual, or if the stage moved by less than the
-            correlation length.
-        """
-        (n, e, ee, p, pp, pe, path), _ = self._sums()
-        if n < 2.0:
-            return 0.0, np.inf
-        ee, pp, pe = ee / n - (e / n) ** 2, pp / n - (p / n) ** 2, pe / n - e * p / n**2
-        # a uniform motion over the correlation length has this variance
-        if 12.0 * pp < (PATH * span) ** 2:
-            return 0.0, np.inf
-        slope, left = pe / pp, ee - pe**2 / pp
-        if left > (1.0 - EXPLAINED) * ee:
-            return slope, np.inf
-        values = max(1.0, path / (2.0 * PATH * span))
-        return float(slope), float(np.sqrt(max(left, 0.0) / (values * pp)))
-
-
-def _sums_of(e: Array, p: Array) -> Array:
-    """Sum errors, predictions and their products; count them and add up the path of p."""
-    path = np.abs(np.diff(p)).sum()
-    return np.array([e.size, e.sum(), e @ e, p.sum(), p @ p, p @ e, path])
+def _sums_of(e: Array) -> Array:
+    """Count errors, and sum them and their squares."""
+    return np.array([e.size, e.sum(), e @ e])

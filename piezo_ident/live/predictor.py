@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import line_between
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
@@ -189,8 +190,7 @@ class Predictor:
             self._clear()
             return
         v0 = self._past.last
-        share = np.arange(1, missing + 1) / (missing + 1)
-        self._advance(t0 + (t1 - t0) * share, v0 + (v1 - v0) * share)
+        self._advance(line_between(t0, t1, missing), line_between(v0, v1, missing))
         self._lowest = float('inf')
 
     def _advance(

@@ -22,7 +22,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.inputs import FAR
 from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
-from piezo_ident.live.corrector import Follower
+from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.history import History
 from piezo_ident.model.stage_model import StageModel
@@ -123,7 +123,7 @@ class Tracker:
         before = None if stream is None else self.follower
         known = before is not None and before.corrector.knows_memory
         gain, model = self.follow == 'gain', self._inverse.model
-        return Follower(model, gain, self._step(), stream, known)
+        return Follower(model, gain, self._step(), (stream or model.stream(), self.tick), known)
 
     @property
     def inverse(self) -> LiveInverse:
@@ -290,12 +290,6 @@ def held(x: Array, before: float) -> Array:
         before = float(x[np.argmax(good)])
     last = np.where(good, np.arange(1, x.size + 1), 0)
     return np.append(before, x)[np.maximum.accumulate(last)]
-
-
-def bridged(x: Array, before: float, missing: int) -> Array:
-    """Put a straight line for the missing samples before a block."""
-    share = np.arange(1, missing + 1) / (missing + 1)
-    return np.append(before + (x[0] - before) * share, x)
 
 
 def check_unit(model: StageModel, x: Array) -> None:

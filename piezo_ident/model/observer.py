@@ -74,6 +74,8 @@ ZEROS = (1e-3, 1.0)
 GAIN_WALK = 1e-3 / np.sqrt(60.0)
 #: rms change of the gain since identification (taste: some ten kelvin and lost poling)
 GAIN_SIZE = 0.1
+#: time constant with which old gains fade from the drift of the gain [s] (taste)
+DRIFT_TIME = 10.0
 #: measurements in a row that make a step, and their spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
 #: rms size of d, as a share of the range of H: uniform, as earlier motion was anywhere in it
@@ -102,8 +104,12 @@ class Observed:
         Creep from earlier motion, and its standard deviation.
     gain, gain_std : ndarray
         Relative change of the gain, and its standard deviation; zero if it is not followed.
+    drift, drift_std : ndarray
+        Change of the gain in a second over the last `DRIFT_TIME`, and its standard deviation.
     band : ndarray
         Largest further change of the offset by plays of unknown output.
+    fading : ndarray, shape (c,)
+        Creep of each element at the last sample.
     """
 
     estimate: Array
@@ -114,7 +120,10 @@ class Observed:
     creep_std: Array
     gain: Array
     gain_std: Array
+    drift: Array
+    drift_std: Array
     band: Array
+    fading: Array
 
 
 class Observer:
@@ -185,6 +194,7 @@ class Observer:
         # in the order of the places in the kernel
         numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, reach**2]
         numbers += [GAIN_WALK**2 * size / rate, GAIN_SIZE**2]
+        numbers += [size / rate, max(2.0, DRIFT_TIME * rate / size)]
         own = int(self._gain)
         # the entry of the gain is set for each group
         row = np.concatenate([[1.0], gains * before.mean(axis=1), np.zeros(own), [1.0]])
@@ -252,20 +262,6 @@ class Observer:
         kernel.forget_refused(now)
         return float(self.model.scaling.Y * step)
 
-    def ahead(self, lead: int, n: int) -> tuple[Array, float]:
-        """
-        Extrapolate offset plus creep [m], shape (n,), and return the relative change of the gain.
-
-        The first of the n samples comes `lead` samples after the last processed sample.
-        """
-        if not self._started:
-            return np.zeros(n), 0.0
-        now, left = self._state.now, self._law.left
-        decay = left ** np.arange(lead, lead + n)[:, None]
-        return self.model.scaling.Y * (now[kernel.OFFSET] + decay @ self._state.coming), float(
-            now[kernel.GAIN]
-        )
-
     def process(self, v: Array, free: Array, measured: Array) -> Observed:
         """
         Estimate the displacement of the next samples; all shapes (n,).
@@ -299,7 +295,7 @@ class Observer:
             self._state.now[kernel.BAND] = band[0]
         whole = np.concatenate([self._past, new], axis=1)
         before, self._past = whole[:, : u.size].copy(), whole[:, u.size :]
-        out = np.empty((8, u.size))
+        out = np.empty((10, u.size))
         kernel.follow(scaling.x(measured), before, new[0], self._law, self._state, out)
         Y = scaling.Y
         return Observed(
@@ -311,7 +307,10 @@ class Observer:
             creep_std=abs(Y) * out[5],
             gain=out[6],
             gain_std=out[7],
+            drift=out[8],
+            drift_std=out[9],
             band=abs(Y) * band,
+            fading=Y * self._state.coming,
         )
 
 

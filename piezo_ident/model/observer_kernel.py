@@ -35,9 +35,12 @@ OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
 # MEAN_X and VAR_X, mean and variance of the free run over the last few strokes
 FREE, IDLE, GAIN, GAIN_VAR, CROSS, MEAN_X, VAR_X = range(16, 23)
 # sums over refused measurements, of their innovations e and of the free run x
-SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE, PLACES = range(23, 30)
-# places in `Law.numbers`
-NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE = range(10)
+SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE = range(23, 29)
+# fading sums over groups, for the drift of the gain g: number, weights w, w t, w t^2, w g, w t g;
+# t is zero now.  Behind them the drift and its standard deviation
+GROUPS, SUM_W, SUM_T, SUM_TT, SUM_G, SUM_TG, DRIFT, DRIFT_STD, PLACES = range(29, 38)
+# places in `Law.numbers`; STEP is the time of a group [s], FADE that of the fading sums [groups]
+NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE, STEP, FADE = range(12)
 
 
 class Law(NamedTuple):
@@ -140,7 +143,7 @@ def _rescale(law: Law, s: State, scale: float) -> None:
 def forget_refused(now: Array) -> None:
     """Forget the refused measurements."""
     now[REFUSED] = now[SCORES] = 0.0
-    now[SEEN:PLACES] = 0.0
+    now[SEEN:GROUPS] = 0.0
 
 
 @ordered_kernel
@@ -279,6 +282,27 @@ def _gain_std(law: Law, s: State) -> float:
 
 
 @ordered_kernel
+def _follow_drift(law: Law, s: State) -> None:
+    # slope of the gain over time by weighted least squares; a gain of which little is known counts
+    # little.  Neighbouring gains err alike, so their number does not reduce the deviation.
+    now, dt, keep = s.now, law.numbers[STEP], 1.0 - 1.0 / law.numbers[FADE]
+    now[SUM_TT] += dt * (dt * now[SUM_W] - 2.0 * now[SUM_T])
+    now[SUM_T] -= dt * now[SUM_W]
+    now[SUM_TG] -= dt * now[SUM_G]
+    now[GROUPS:DRIFT] *= keep
+    w = 1.0 / max(_gain_std(law, s) ** 2, 1e-30)
+    now[GROUPS] += 1.0
+    now[SUM_W] += w
+    now[SUM_G] += w * now[GAIN]
+    spread = now[SUM_TT] - now[SUM_T] ** 2 / now[SUM_W]
+    now[DRIFT], now[DRIFT_STD] = 0.0, np.sqrt(law.numbers[GAIN_SIZE])
+    # over less than a second a drift is no more than its prior
+    if spread > now[SUM_W] / 12.0:
+        now[DRIFT] = (now[SUM_TG] - now[SUM_T] * now[SUM_G] / now[SUM_W]) / spread
+        now[DRIFT_STD] = min(now[DRIFT_STD], np.sqrt(now[GROUPS] / spread))
+
+
+@ordered_kernel
 def _end_group(law: Law, s: State) -> None:
     now = s.now
     _let_time_pass(law, s)
@@ -292,6 +316,8 @@ def _end_group(law: Law, s: State) -> None:
         _measure(law, s, mean, count)
         now[MOVED] = now[SPREAD] = 0.0
     tell(law, s)
+    if _has_gain(law, s):
+        _follow_drift(law, s)
 
 
 @ordered_kernel
@@ -299,8 +325,8 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
     """
     Take y with free run, path and band of a horizon before; write the corrections to `out`.
 
-    The rows of `out`, shape (8, n), are the whole correction of the present free run, offset,
-    creep and gain.  The standard deviation of each follows it.
+    The rows of `out`, shape (10, n), are the whole correction of the present free run, offset,
+    creep, gain, and drift of the gain [1/s].  The standard deviation of each follows it.
     """
     now, size = s.now, s.group.shape[1]
     gain_std = _gain_std(law, s)
@@ -331,3 +357,4 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
         out[2, k], out[3, k] = now[OFFSET], np.sqrt(now[OFFSET_VAR])
         out[4, k], out[5, k] = creep, np.sqrt(now[CREEP_VAR])
         out[6, k], out[7, k] = now[GAIN], gain_std
+        out[8, k], out[9, k] = now[DRIFT], now[DRIFT_STD]

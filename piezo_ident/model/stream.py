@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, line_between
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
@@ -100,10 +100,9 @@ class Stream:
         missing = follows(one, other)
         if not missing:
             return
-        share = np.arange(1, missing + 1) / (missing + 1)
 
         def line(before: Array, after: Array) -> Array:
-            return np.asarray(before[-1] + (after[0] - before[-1]) * share)
+            return line_between(float(before[-1]), float(after[0]), missing)
 
         channels = {k: line(x, other.channels[k]) for k, x in one.channels.items()}
         time = line(one.time(one.n - 1, one.n), other.time(0, 1))

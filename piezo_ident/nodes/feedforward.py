@@ -41,14 +41,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import line_between
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.live.corrector import MOST
+from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.pacing import Looks, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
-from piezo_ident.live.tracker import bridged, check_unit, Drive, held, Successor, Tracker
+from piezo_ident.live.tracker import check_unit, Drive, held, Successor, Tracker
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
@@ -240,7 +241,7 @@ class FeedforwardNode(DrivingNode):
             self._faults.note('not_finite', f'{bad} {about}', bad)
         if verdict.kind is Kind.GAP:
             self._faults.note('lost', verdict.reason, verdict.missing)
-            x = bridged(x, self._last_value, verdict.missing)
+            x = np.append(line_between(self._last_value, float(x[0]), verdict.missing), x)
         self._last = time.monotonic()
         if not self._labels or self._labels[-1][1] != samples.segment:
             self._labels.append((self._heard, samples.segment))

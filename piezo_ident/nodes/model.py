@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.live.corrector import Corrector, Estimated, gain_change
+from piezo_ident.live.corrector import Corrector, Estimated
 from piezo_ident.live.monitor import LiveError, Matched, Matcher, Preview, PreviewBin
 from piezo_ident.live.predictor import Predictor, warm_up
 from piezo_ident.model.metrics import expected_error, percent
@@ -241,8 +241,8 @@ class ModelNode(LabNode):
             return '', ''
         if left > ratio * before:
             said = f'{left:.3g} % of stroke, {left / before:.1f} times that at identification'
-            if gain := gain_change(*self._left.gain(span)):
-                said += f', and goes with the displacement: {gain}'
+            if changed := self._corrector.changed:
+                said += f'; what changed: {changed}'
             return f'identify again, or diagnose on this motion: the live error is {said}', ''
         if self._error.seconds and self._live_error(model) > ratio * before:
             return '', f'corrected: {self._corrector.corrected}'

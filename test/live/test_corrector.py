@@ -15,6 +15,7 @@ from piezo_ident.live.monitor import Matcher
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.observer import observe
 from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 import pytest
@@ -134,6 +135,55 @@ def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():
     told = [row for one in line.got for row in one.corrections]
     assert len(told) == N / FS * 100
     assert told[-1] == line.corrector.told and 0.0 < told[-1]['gain/std'] < 1e-2
+
+
+H = MODEL.hysteresis
+
+
+def with_modes(factor):
+    """Return the model with the frequencies of its modes multiplied."""
+    poles = MODEL.dynamics.poles**factor
+    a = np.real(np.poly(poles))
+    b = MODEL.dynamics.b * a.sum() / (1.0 + MODEL.dynamics.a.sum())
+    return replace(MODEL, dynamics=Dynamics(a[1:], b))
+
+
+@pytest.mark.parametrize(
+    ('stage', 'names'),
+    [
+        (MODEL, set()),
+        (replace(MODEL, hysteresis=H.scaled(1.03)), {'gain +3.0'}),
+        (replace(MODEL, hysteresis=replace(H, weights=1.1 * H.weights)), {'loop width +10.0'}),
+        (replace(MODEL, hysteresis=replace(H, weights=0.9 * H.weights)), {'loop width -10.0'}),
+        (with_modes(0.7), {'slower dynamics'}),
+        (with_modes(1.3), {'faster dynamics'}),
+        (replace(with_modes(0.7), hysteresis=H.scaled(1.01)), {'gain +1.0', 'slower dynamics'}),
+    ],
+)
+def test_what_changed_of_a_running_stage_is_named_with_its_size(stage, names):
+    line, rng = Line(), np.random.default_rng(2)
+    # an offset, noise and lost words change none of the names
+    y = stage.simulate(V) + 0.4e-6 + 2e-9 * rng.standard_normal(N)
+    y[777::900] = 0.0
+    for k in range(0, N, 100):
+        cut = slice(k, k + 100)
+        line.voltage(cut)
+        line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+    said = line.corrector.changed
+    assert all(name in said for name in names)
+    assert len(said.split(', ')) == max(len(names), 1) and bool(said) == bool(names)
+
+
+def test_an_error_of_another_kind_is_given_no_name():
+    line = Line()
+    # a disturbance of another frequency, and a bend of the characteristic
+    for more in (1e-7 * np.sin(2 * np.pi * 37 * T), 2e-8 * (V - 5.0) ** 2):
+        y = MODEL.simulate(V) + more
+        for k in range(0, N, 100):
+            cut = slice(k, k + 100)
+            line.voltage(cut)
+            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        assert line.corrector.changed == ''
 
 
 def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():

@@ -133,7 +133,7 @@ SLOW = EffectSetting('creep', {'gain': [0.02, 0.01], 'time_constant': [0.1, 5.0]
 CREEPS = replace(PAPER, effects=(SLOW,), identification={'errors': {'held_out': 0.02}})
 
 
-def run_of(follow, gain=1.0, zero=0.0, earlier=False, seconds=1.5, readings=lambda y: y):
+def run_of(follow, gain=1.0, zero=0.0, earlier=False, seconds=1.5, readings=lambda y: y, size=100):
     """Return tracker, voltage and error in % of the scan's span, of a stage that answers."""
     tracker, stage = Tracker(CREEPS, SETTINGS, 400, follow=follow), CREEPS.stream()
     if earlier:
@@ -141,8 +141,8 @@ def run_of(follow, gain=1.0, zero=0.0, earlier=False, seconds=1.5, readings=lamb
         stage.process(np.concatenate([way, np.full(40_000, 10.0), way[::-4], np.zeros(2000)]))
     x, rng = sine(seconds, 10.0), np.random.default_rng(1)
     v, error = [], []
-    for k in range(0, x.size, 100):
-        drive = tracker.process(x[k : k + 100])
+    for k in range(0, x.size, size):
+        drive = tracker.process(x[k : k + size])
         y = stage.process(drive.v)
         s = CREEPS.scaling
         y = s.y0 + (y - s.y0) * gain + zero
@@ -175,6 +175,15 @@ def test_the_voltage_makes_up_for_creep_gain_and_zero(case, alone):
         case.get('gain', 1.0) - 1.0, abs=1e-3
     )
     assert not tracker.follower.is_limited
+
+
+@pytest.mark.parametrize('size', [37, 640])
+def test_how_the_streams_are_cut_does_not_matter_to_what_follows(size):
+    case = {'gain': 1.03, 'earlier': True, 'seconds': 0.6}
+    one, other = run_of('gain', **case), run_of('gain', **case, size=size)
+    # volts; the correction is about 0.2 V
+    np.testing.assert_allclose(one[1], other[1], rtol=0, atol=1e-9)
+    assert np.abs(one[1] - run_of('off', **case)[1]).max() > 0.1
 
 
 def test_what_follows_costs_nothing_where_nothing_changed():

@@ -358,6 +358,21 @@ def test_a_step_of_the_gain_amid_a_scan_is_told_by_size_and_corrected():
         assert np.mean(np.abs(seen.estimate - truth) < 2.0 * seen.std) > 0.95
 
 
+def test_a_drift_of_the_gain_is_told_by_size():
+    model, n = creeping(), 60_000
+    v = moved(n, frequency=2.0, low=2.0, high=8.0)
+    t = np.arange(n) / SLOW_RATE
+    for drift in (2e-4, 0.0):
+        truth = (1.0 + drift * t) * model.simulate(v)
+        piece = Piece(v, with_noise(truth, 1.5e-9), SLOW_RATE)
+        seen = observe(model, piece, error=1e-4 * SPAN, gain=True)
+        assert abs(seen.drift[-1] - drift) < 3.0 * seen.drift_std[-1]
+        assert abs(seen.drift[-1] - drift) < 4e-5
+        # a zero, a stage at rest and the first second tell nothing of it
+        assert not seen.drift[:900].any()
+    assert seen.drift_std[-1] < 2e-4
+
+
 def test_a_stage_whose_law_is_another_is_served_no_worse_with_the_gain_observed():
     # made by hand: beside H a loop that follows a first-order law of the path, as of Duhem
     rate, step, n = 10_000, 15_000, 50_000
