@@ -205,6 +205,11 @@ class Corrector:
         causes = self._attribution.causes if self._attribution is not None else []
         return ', '.join(str(cause) for cause in causes)
 
+    @property
+    def doubt(self) -> str:
+        """What the sensor does that the stage hardly does; empty if the sensor seems sound."""
+        return self._observer.doubt if self._observer is not None else ''
+
     def _forget(self) -> None:
         self._clock = BlockClock()
         self._observer: Observer | None = None

@@ -78,6 +78,9 @@ GAIN_SIZE = 0.1
 DRIFT_TIME = 10.0
 #: measurements in a row that make a step, and their spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
+#: largest and smallest slope of refused measurements over the free run that make a changed sign;
+#: a reading of the other sign has -2 (taste)
+MIRRORED = (-2.5, -1.5)
 #: rms size of d, as a share of the range of H: uniform, as earlier motion was anywhere in it
 BEYOND = 1.0 / np.sqrt(12.0)
 #: deviation beyond which a measurement is refused at first, in standard deviations (taste)
@@ -237,6 +240,27 @@ class Observer:
     def lose_memory(self) -> None:
         """Note that voltage was lost before the next sample."""
         self._is_lost = True
+
+    @property
+    def doubt(self) -> str:
+        """What the sensor does that the stage hardly does; empty if the sensor seems sound."""
+        if not self._started:
+            return ''
+        now = self._state.now
+        n, e, ee, x, xx, xe = now[kernel.SEEN : kernel.SUM_XE + 1].tolist()
+        if now[kernel.STUCK_NOW]:
+            return 'it stays the same while the stage should move'
+        if n < STEADY:
+            return ''
+        swing2 = xx - x**2 / n
+        # the variance of a uniform motion that is long enough for a reading to count as stuck
+        if 12.0 * swing2 > n * kernel.STUCK**2:
+            slope = (xe - x * e / n) / swing2
+            if MIRRORED[0] < slope < MIRRORED[1]:
+                return 'it moves against the stage'
+        if max(ee / n - (e / n) ** 2, 0.0) <= (SPREAD * e / n) ** 2:
+            return 'it has stepped'
+        return ''
 
     def accept(self) -> float:
         """

@@ -38,7 +38,9 @@ FREE, IDLE, GAIN, GAIN_VAR, CROSS, MEAN_X, VAR_X = range(16, 23)
 SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE = range(23, 29)
 # fading sums over groups, for the drift of the gain g: number, weights w, w t, w t^2, w g, w t g;
 # t is zero now.  Behind them the drift and its standard deviation
-GROUPS, SUM_W, SUM_T, SUM_TT, SUM_G, SUM_TG, DRIFT, DRIFT_STD, PLACES = range(29, 38)
+GROUPS, SUM_W, SUM_T, SUM_TT, SUM_G, SUM_TG, DRIFT, DRIFT_STD = range(29, 37)
+# whether the free run has moved since the reading changed last
+STUCK_NOW, PLACES = range(37, 39)
 # places in `Law.numbers`; STEP is the time of a group [s], FADE that of the fading sums [groups]
 NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE, STEP, FADE = range(12)
 
@@ -335,9 +337,10 @@ def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array)
         creep = 0.0
         if not np.isnan(then):  # NaN comes before the start
             if y[k] != now[READING] and np.isfinite(y[k]):
-                now[READING], now[BEGAN] = y[k], then
-            stuck = abs(then - now[BEGAN]) > STUCK
-            s.group[0, int(now[COUNT])] = np.nan if stuck else y[k] - then
+                now[READING], now[BEGAN], now[STUCK_NOW] = y[k], then, 0.0
+            if np.isfinite(y[k]) and abs(then - now[BEGAN]) > STUCK:
+                now[STUCK_NOW] = 1.0
+            s.group[0, int(now[COUNT])] = np.nan if now[STUCK_NOW] else y[k] - then
             s.group[1, int(now[COUNT])] = then
             now[COUNT] += 1.0
             now[PATH] += before[1, k]

@@ -51,6 +51,7 @@ class ModelNode(LabNode):
         # error of the estimate
         self._left = LiveError(self.values['window'])
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0
+        self._doubt = ''
         self._problems: dict[str, float] = {}
         self._range = (float('inf'), float('-inf'))
         self._count, self._count_at, self._work = 0, time.monotonic(), 0.0
@@ -205,6 +206,10 @@ class ModelNode(LabNode):
                 self._corrections.publish(message)
             if one.is_settled:
                 self._left_by(self._estimates.predicted(samples))
+        if several and (doubt := self._corrector.doubt) != self._doubt:
+            self._doubt = doubt
+            if doubt:
+                self._note_problem(f'reading or zero of the displacement: {doubt}')
 
     def _left_by(self, pairs: list[Matched]) -> None:
         for pair in pairs:

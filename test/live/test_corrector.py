@@ -174,6 +174,30 @@ def test_what_changed_of_a_running_stage_is_named_with_its_size(stage, names):
     assert len(said.split(', ')) == max(len(names), 1) and bool(said) == bool(names)
 
 
+@pytest.mark.parametrize(
+    ('fault', 'says'),
+    [
+        (lambda y: y, ''),
+        (lambda y: 1.03 * y, ''),
+        (lambda y: y + 1e-6, 'stepped'),
+        (lambda y: 60e-6 - y, 'against the stage'),
+        (lambda y: np.full(y.size, y[0]), 'stays the same'),
+    ],
+)
+def test_a_sensor_at_fault_is_told_within_a_fifth_of_a_second_of_motion(fault, says):
+    line, y, at, told = Line(), Y.copy(), 6000, []
+    y[at:] = fault(y[at:])
+    for k in range(0, N, 100):
+        cut = slice(k, k + 100)
+        line.voltage(cut)
+        line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        told.append(line.corrector.doubt)
+    assert not any(told[: at // 100])
+    # 0.2 s of a scan of 5 Hz
+    assert all(says in said for said in told[at // 100 + 40 :])
+    assert bool(told[-1]) == bool(says)
+
+
 def test_an_error_of_another_kind_is_given_no_name():
     line = Line()
     # a disturbance of another frequency, and a bend of the characteristic

@@ -396,6 +396,7 @@ def test_a_step_of_the_sensor_is_accepted_at_once(fast):
     assert not ok and 'no step to accept' in said
     ok, said = until(80, 120)
     assert ok and '+1 um' in said, said
+    fast.wait(lambda: 'reading or zero' in fast.status('model')['text'], 'the step')
     until(120, 240)
     assert np.abs(estimate[-1].values - y[-100:]).max() < 2e-8
 
