@@ -25,6 +25,7 @@ import time
 from demo_page import Motion, MOTIONS, Session, STAGE, write_page
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.model.observer import observe
 from tqdm import tqdm
 
 try:
@@ -105,7 +106,8 @@ def offline(out: Path, progress: Progress) -> Session:
 def _motion(model: pi.StageModel, record: pi.Record) -> Motion:
     run = pi.free_run(model, record)
     t, v = (np.concatenate([getattr(piece, name) for piece in record]) for name in ('t', 'v'))
-    return Motion(t, v, run.measured, run.predicted)
+    estimate = np.concatenate([observe(model, piece).estimate for piece in record])
+    return Motion(t, v, run.measured, run.predicted, estimate)
 
 
 def main() -> int:
@@ -131,7 +133,8 @@ def main() -> int:
         sys.stderr.write('demo: interrupted\n')
         return 130
     progress.close()
-    sys.stdout.write(f'before: {session.before.text}\nafter:  {session.after.text}\nopen {page}\n')
+    sys.stdout.write(f'before: {session.before.text}\nafter:  {session.after.text}\n')
+    sys.stdout.write(f'estimate after: {session.after.estimate_text}\nopen {page}\n')
     for problem in session.problems:
         sys.stderr.write(f'demo: {problem}\n')
     return 1 if session.problems else 0

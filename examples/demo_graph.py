@@ -27,6 +27,7 @@ from piezo_ident.record.blocks import decode
 #: what the recorder must have as it was on the wire, and what a model makes of it
 MEASURED = ('/voltage', '/displacement', '/applied_voltage')
 PREDICTION, REPLAYED = '/prediction', '/replay/prediction'
+ESTIMATE = '/estimate'  # waits for displacement, so its end may be missing
 #: of the states of the identifier, those that are a step of their own
 STATES = {
     'exciting': 'excitation',
@@ -287,7 +288,10 @@ class Lab:
         self.wait(lambda: self.client.status('recorder'), 'the recorder')
         self.call('recorder/stop', step)
         recording = self._recording(bag, n)
-        self.progress.say(f'{step}: residual of the model {recording.motion.text}; in {bag}')
+        text, left = recording.motion.text, recording.motion.estimate_text
+        self.progress.say(
+            f'{step}: residual of the model {text}, of its estimate {left}; in {bag}'
+        )
         return recording, recording.lost
 
     def play_to_diagnose(self) -> tuple[Recording, str]:
@@ -296,14 +300,17 @@ class Lab:
         return self.play('motions', 'before')
 
     def _recording(self, bag: Path, n: int) -> Recording:
-        blocks = blocks_in(bag, (*MEASURED, PREDICTION))
+        blocks = blocks_in(bag, (*MEASURED, PREDICTION, ESTIMATE))
+        estimated = rows_of(blocks.pop(ESTIMATE))
         equal = {topic: blocks[topic] == self.wire.blocks[topic] for topic in MEASURED}
         topics = ('/voltage', '/displacement', PREDICTION)
         t, values = together(*(rows_of(blocks[topic]) for topic in topics))
         if not t.size:
             raise pi.DataError(f'{bag}: no samples that all of {", ".join(topics)} have')
         lost = self.wire.lacks(n) or lacking({k: len(rows_of(x)) for k, x in blocks.items()}, n)
-        return Recording(bag, blocks, equal, Motion(t, *values), lost)
+        known = dict(estimated.tolist())
+        estimate = np.array([known.get(at, np.nan) for at in t.tolist()])
+        return Recording(bag, blocks, equal, Motion(t, *values, estimate), lost)
 
     # the replay
 

@@ -29,24 +29,34 @@ SAME = 1e-12
 LOOPS = (('sine:1Hz', 1.0), ('sine:120Hz', 120.0))
 #: of the fastest one, so many periods are drawn over time
 PERIODS = 3
-BEFORE, AFTER = style.VERMILION, style.BLUE
+BEFORE, AFTER, ESTIMATE = style.VERMILION, style.BLUE, style.GREEN
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The motions as the stage made them and as a model predicted them [s, V, m, m]."""
+    """
+    The motions as the stage made them, as a model predicted and as it estimated them, in s, V, m.
+
+    The estimate is NaN where there is none.
+    """
 
     t: Array
     v: Array
     y: Array
     y_hat: Array
+    estimate: Array
 
     @property
     def residual(self) -> Array:
         """Measured - predicted [m]."""
         return self.y - self.y_hat
+
+    @property
+    def left(self) -> Array:
+        """Measured - estimated [m]."""
+        return self.y - self.estimate
 
     @property
     def stroke(self) -> float:
@@ -56,8 +66,16 @@ class Motion:
     @property
     def text(self) -> str:
         """The residual for people."""
-        rms = float(np.sqrt(np.mean(self.residual**2)))
-        size, spread = 1e9 * rms, 1e9 * float(np.std(self.residual))
+        return self._text(self.residual)
+
+    @property
+    def estimate_text(self) -> str:
+        """The error of the estimate for people."""
+        return self._text(self.left[np.isfinite(self.left)])
+
+    def _text(self, error: Array) -> str:
+        rms = float(np.sqrt(np.mean(error**2)))
+        size, spread = 1e9 * rms, 1e9 * float(np.std(error))
         percent = 100.0 * rms / self.stroke
         return f'{size:.0f} nm ({percent:.3f} % of stroke), {spread:.0f} nm without its mean'
 
@@ -191,11 +209,12 @@ def traces_figure(after: Motion) -> Figure:
 
 
 def residual_figure(before: Motion, after: Motion) -> Figure:
-    """Draw the residual over time, before and after."""
+    """Draw the residual over time, before and after, and the error of the estimate."""
     fig = style.figure(3.2)
     axes = fig.subplots()
-    for motion, label, colour in ((before, 'before', BEFORE), (after, 'after', AFTER)):
-        style.line(axes, motion.t, 1e9 * motion.residual, colour, label, linewidth=0.8)
+    errors = ((before, before.residual, 'before', BEFORE), (after, after.residual, 'after', AFTER))
+    for motion, e, label, colour in (*errors, (after, after.left, 'estimate', ESTIMATE)):
+        style.line(axes, motion.t, 1e9 * e, colour, label, linewidth=0.8)
     style.tidy(axes, 'time / s', 'residual / nm')
     axes.axhline(0.0, color=style.ZERO, linewidth=0.6, zorder=1)
     style.percent_axis(axes, 1e9 * after.stroke)
@@ -204,7 +223,7 @@ def residual_figure(before: Motion, after: Motion) -> Figure:
             axes.axvline(begin, color=style.COLOURS['band'], linewidth=0.8, zorder=1)
             style.name_above(axes, label, 0.5 * (begin + end))
     axes.margins(x=0.01)
-    style.legend(axes, loc='lower center', ncols=2)
+    style.legend(axes, loc='lower center', ncols=3)
     return fig
 
 
@@ -255,13 +274,17 @@ def _motion_parts(session: Session) -> Iterable[Section]:
             Table(
                 'Residual of the same motions, rms',
                 ('', 'residual'),
-                [('before the diagnosis', before.text), ('after it', after.text)],
+                [
+                    ('before the diagnosis', before.text),
+                    ('after it', after.text),
+                    ('of the estimate after it', after.estimate_text),
+                ],
             ),
             Shown(
                 'residual',
                 'The residual',
-                'What the model misses, before and after the diagnosis. '
-                + (NOTE if live else 'What remains is the noise of the sensor.'),
+                'What the model misses, before and after the diagnosis, and what its estimate '
+                'misses. ' + (NOTE if live else 'What remains is the noise of the sensor.'),
                 style.png(residual_figure(before, after)),
             ),
         ],
@@ -269,8 +292,8 @@ def _motion_parts(session: Session) -> Iterable[Section]:
 
 
 #: below the residual of the running graph
-NOTE = """What remains is slow: creep that earlier motions have left. The model cannot know it,
-since it begins at rest with each stream."""
+NOTE = """What remains of the prediction is slow: creep of earlier motions, unknown to a free run
+that begins at rest. The estimate corrects it by displacement that is at least 100 samples old."""
 
 
 def _played(commands: Sequence[str]) -> Section:
@@ -346,6 +369,7 @@ def write_page(out: Path, session: Session, lines: Sequence[str]) -> Path:
         for when in ('before', 'after')
     ]
     recorded = session.recorded
+    facts.append(('estimate of the last motions', session.after.estimate_text))
     if recorded is not None:
         facts.append(('free run live, replayed, offline', recorded.verdict))
     links = {

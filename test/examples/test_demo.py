@@ -53,6 +53,9 @@ def test_the_demo_finds_what_is_hidden_and_its_page_leads_to_the_rest(tmp_path):
         for word in ('before', 'after')
     )
     assert after < 0.3 * before
+    # mean included
+    estimate = re.search(r'^estimate after: \d+ nm \(([\d.]+) % of stroke', done.stdout, re.M)
+    assert float(estimate[1]) <= 0.02
     diagnosis = json.loads((out / 'reports' / 'diagnosis' / 'diagnosis.json').read_text())
     assert 'creep' in [effect['name'] for effect in diagnosis['effects']]
     page = (out / 'index.html').read_text(encoding='utf-8')
@@ -98,7 +101,7 @@ def test_the_page_shows_the_motions_the_residual_the_bag_the_commands_and_plotju
     motions = pi.Program.load(demo_page.MOTIONS).build()
     # fewer samples are drawn faster
     t, v = motions.t[::50], motions.v[::50]
-    motion = demo_page.Motion(t, v, 1e-6 * v, 1.01e-6 * v)
+    motion = demo_page.Motion(t, v, 1e-6 * v, 1.01e-6 * v, 1.002e-6 * v)
     diagnosis = {'sentence': 'Creep explains it.'}
     diagnosis['error'] = {when: {'overall': 0.5} for when in ('before', 'after')}
     (tmp_path / 'reports/diagnosis').mkdir(parents=True)
@@ -113,6 +116,8 @@ def test_the_page_shows_the_motions_the_residual_the_bag_the_commands_and_plotju
     places = [page.rindex(text) if 'id=' in text else page.index(text) for text in wanted]
     assert places == sorted(places)
     assert page.index('2.5e-16 of stroke') < places[0]
+    # prediction and estimate, both with their size
+    assert motion.text in page and page.count(motion.estimate_text) == 2
     # a path with a blank can be pasted
     line = next(line for line in page.splitlines() if 'plotjuggler --layout' in line)
     _, _, command = line.rpartition('<pre>')

@@ -83,6 +83,8 @@ def test_the_bag_is_the_wire_and_the_free_run_is_the_same_live_replayed_and_offl
     assert recorded.problems == []
     # the stage is its own model: noise is left, and creep where the machine was too busy at first
     assert np.std(recording.motion.residual) < 1e-6
+    assert np.mean(np.isfinite(recording.motion.estimate)) > 0.9
+    assert np.nanstd(recording.motion.left) < 1e-6
     assert recorded.verdict in lab.progress.lines[-1]
     assert 'of stroke' in recorded.verdict
     # what was asked can be asked again
