@@ -260,12 +260,26 @@ class Adaptation:
         sound : bool, optional
             Whether to learn from these samples; False while outputs of plays are unknown.
         """
-        Y, s = self.model.scaling.Y, self.model.scaling
-        new = np.stack([s.x(free), *[(run.process(v, t) - free) / Y for run in self._runs]])
+        s = self.model.scaling
+        new = self.responses(v, t, free)
         whole = np.concatenate([self._past, new], axis=1)
         before, self._past = whole[:, : v.size].copy(), whole[:, v.size :].copy()
         y = s.x(measured) if sound else np.full(v.size, np.nan)
-        out = np.empty(v.size)
+        return np.asarray(free + s.Y * self.learn(y, before, new))
+
+    def responses(self, v: Array, t: Array, free: Array) -> Array:
+        """Run each changed model; return the free run and the responses to unit changes."""
+        s = self.model.scaling
+        return np.stack([s.x(free), *[(run.process(v, t) - free) / s.Y for run in self._runs]])
+
+    def learn(self, y: Array, before: Array, new: Array) -> Array:
+        """
+        Learn from normalised displacement; return what the learnt changes add to the free run.
+
+        The rows of `before` and `new` are the free run and the responses, a horizon before and
+        now; shapes (k, n).
+        """
+        out = np.empty(y.size)
         kernel.learn(
             y,
             before,
@@ -281,4 +295,4 @@ class Adaptation:
             self._group,
             out,
         )
-        return np.asarray(free + Y * out)
+        return out
