@@ -401,6 +401,23 @@ def test_a_step_of_the_sensor_is_accepted_at_once(fast):
     assert np.abs(estimate[-1].values - y[-100:]).max() < 2e-8
 
 
+def test_the_estimate_goes_on_behind_a_gap_and_a_restart(fast):
+    reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}}))
+    # a zero that moved is in each estimate
+    y = model_of(paper()).stream().process(sine(8000)[1], np.arange(8000) / FS) + 3e-7
+    estimate = fast.collect('estimate')
+    for segment, cuts in (('gap', ((0, 30), (32, 80))), ('restart', ((0, 80),))):
+        several = [replace(b, segment=segment) for b in blocks(8000)]
+        for begin, end in cuts:
+            paired(fast, several[begin:end], y[100 * begin : 100 * end])
+        last = (segment, several[-1].t[-1])
+        fast.wait(
+            lambda last=last: estimate and (estimate[-1].segment, estimate[-1].t[-1]) == last,
+            'all estimates',
+        )
+        assert np.abs(estimate[-1].values - y[-100:]).max() < 5e-8
+
+
 def paired(g, several, y):
     """Send blocks of voltage, each with the displacement of the same time."""
     for block, part in zip(several, np.split(y, len(several)), strict=True):
