@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 import piezo_ident as pi
+from piezo_ident.model.observer import observe
 from processes import take_domain
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,6 +86,10 @@ def test_the_bag_is_the_wire_and_the_free_run_is_the_same_live_replayed_and_offl
     assert np.std(recording.motion.residual) < 1e-6
     assert np.mean(np.isfinite(recording.motion.estimate)) > 0.9
     assert np.nanstd(recording.motion.left) < 1e-6
+    # and so is the estimate
+    (piece,) = pi.read(recorded.bag)
+    offline = observe(pi.load(recorded.model), piece).estimate
+    assert np.nanmax(np.abs(recording.motion.estimate - offline)) <= 1e-12 * recorded.stroke
     assert recorded.verdict in lab.progress.lines[-1]
     assert 'of stroke' in recorded.verdict
     # what was asked can be asked again
