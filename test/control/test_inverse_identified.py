@@ -51,7 +51,8 @@ def labelled(record):
 @pytest.fixture(scope='module')
 def unlabelled(record):
     pieces = tuple(replace(piece, segments=()) for piece in record.pieces)
-    return pi.identify(replace(record, pieces=pieces), Settings(max_order=6)).model
+    settings = Settings(order=(6, 6), thresholds=10)
+    return pi.identify(replace(record, pieces=pieces), settings).model
 
 
 @pytest.fixture(scope='module')

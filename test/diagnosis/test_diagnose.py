@@ -622,17 +622,12 @@ def test_columns_that_may_be_swapped_are_said():
     assert set(suspicions(swapped)) <= set(found.warnings)
 
 
-@pytest.mark.parametrize(
-    ('scale', 'said'), [(1.0, []), (1e-3, ['in volts?']), (1e3, ['extrapolation'])]
-)
-def test_voltages_that_the_model_does_not_know_are_said(scale, said):
+def test_voltages_that_the_model_does_not_know_are_said():
     model, record, _ = measured(None, 0.0, 1)
     (piece,) = record.pieces
-    scaled = Record((replace(piece, v=scale * piece.v),), 'scaled')
-    found = diagnose(model, scaled, ONLY_CREEP)
-    heard = [w for w in found.warnings if w.startswith('scaled: ')]
-    assert len(heard) == len(said)
-    assert all(part in line for part, line in zip(said, heard, strict=True))
+    found = diagnose(model, Record((replace(piece, v=1e3 * piece.v),), 'scaled'), ONLY_CREEP)
+    (heard,) = [w for w in found.warnings if w.startswith('scaled: ')]
+    assert 'extrapolation' in heard
 
 
 def test_one_pass_over_the_range_names_nothing():

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from diagnosis_examples import CREEP, NOISE, played, refined_model, with_effects
 import numpy as np
-from piezo_ident import diagnose
+from piezo_ident import diagnose, DiagnosisSettings
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
@@ -16,6 +16,8 @@ from programs import SLOW, slow_model
 import pytest
 
 STILL = 'still crept from motion'
+#: what motion before a record may be taken for
+FEW = DiagnosisSettings(effects=('creep', 'thermal_drift', 'gain_drift'))
 #: five seconds near the upper end
 MOVED = 10.0 * np.sin(np.linspace(0.0, np.pi, round(5 * SLOW))) ** 0.25
 
@@ -80,7 +82,8 @@ def test_a_model_that_creeps_lacks_nothing(moved):
 
 def test_a_sensor_set_to_zero_since_makes_no_difference(moved, found):
     (piece,) = moved.pieces
-    again = diagnose(slow_model(), Record((replace(piece, y=piece.y + 30e-6),), 'zero'))
+    zero = Record((replace(piece, y=piece.y + 30e-6),), 'zero')
+    again = diagnose(slow_model(), zero, FEW)
     assert [e.name for e in again.effects] == ['creep']
     assert again.after.overall < 0.02 and unseen(again.model) < 0.03
 
@@ -89,7 +92,7 @@ def test_a_drift_that_no_creep_leaves_is_a_drift():
     """A stage at the lowest voltage sinks after earlier motion; this one rises, and by more."""
     drift = {'amplitude': 0.02, 'time_constant': 2.0}
     record = played(with_effects(creep=CREEP, thermal_drift=drift), 'drift')
-    result = diagnose(slow_model(), record)
+    result = diagnose(slow_model(), record, FEW)
     assert [e.name for e in result.effects] == ['creep', 'thermal_drift']
     assert not any(STILL in w for w in result.warnings)
     assert unseen(result.model) < 0.03
@@ -119,7 +122,7 @@ def test_it_is_said_that_the_stage_still_crept(found):
 
 
 def test_a_stage_that_rested_creeps_from_rest():
-    result = diagnose(slow_model(), crept(20.0))
+    result = diagnose(slow_model(), crept(20.0), FEW)
     assert [e.name for e in result.effects] == ['creep']
     assert not any(STILL in w for w in result.warnings)
     assert unseen(result.model) < 0.03

