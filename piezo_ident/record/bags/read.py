@@ -308,7 +308,7 @@ def _topic_of(
     if asked is not None:
         topic = f'/{asked.lstrip("/")}'
         if carried.get(topic) != quantity:
-            has = f'{topic} carries {carried[topic]}, not {quantity}'
+            has = f'{topic} carries {carried.get(topic)}, not {quantity}'
             fault = has if topic in carried else f'no samples on topic {topic}'
             raise DataError(f'{path}: {fault}; topics with samples: {topics}')
         return topic
