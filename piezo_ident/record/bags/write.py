@@ -337,8 +337,16 @@ def write_bag(
 
 
 def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
+    store = typestore()
+    types: Any = store.types
+    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
     further = dict.fromkeys(quantity_of_channel(k) for p in record for k in p.channels)
-    senders = {q: _sender(writer, q) for q in ('voltage', 'displacement', *further)}
+    connections = {
+        q: writer.add_connection(
+            f'/{q}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
+        )
+        for q in ('voltage', 'displacement', *further)
+    }
     shift, latest = 0, 0.0
     for piece in record:
         columns = {'voltage': piece.v, 'displacement': piece.y}
@@ -357,21 +365,7 @@ def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
                     f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
                 )
             for quantity, x in columns.items():
-                senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
-
-
-def _sender(writer: JazzyWriter, quantity: str) -> Callable[[Samples, int], None]:
-    store = typestore()
-    types: Any = store.types
-    dimension = types['std_msgs/msg/MultiArrayDimension']
-    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
-    connection = writer.add_connection(
-        f'/{quantity}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
-    )
-
-    def send(samples: Samples, stamp: int) -> None:
-        data, dims = encode(samples)
-        filled = message(layout([dimension(*d) for d in dims], 0), data)
-        writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
-
-    return send
+                data, dims = encode(Samples(t, x[start:stop], label, quantity))
+                filled = [types['std_msgs/msg/MultiArrayDimension'](*d) for d in dims]
+                raw = store.serialize_cdr(message(layout(filled, 0), data), MESSAGE_TYPE)
+                writer.write(connections[quantity], stamp, raw)
