@@ -204,9 +204,9 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     ):
         here = [i for i, way in enumerate(ways) if way == one]
         if len(here) > 1:
-            ways = f'--columns {role}={here[0] + 1} or {role}={here[1] + 1}'
+            option = f'--columns {role}={here[0] + 1} or {role}={here[1] + 1}'
             fault = f'column {listed([wanted])} stands there twice; say which by its number'
-            raise DataError(f'{path}: {fault}: {ways}')
+            raise DataError(f'{path}: {fault}: {option}')
         if here:
             return here[0]
     if is_number:

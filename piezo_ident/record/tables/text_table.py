@@ -187,6 +187,9 @@ def _whole_rows(lines: Iterator[str]) -> list[str]:
             raise csv.Error('a quoted cell has no end')
         chunk.append(line)
         quotes += line.count('"')
+    # numpy drops a quote inside of a cell
+    for _ in csv.reader(chunk if quotes else (), strict=True):
+        pass
     return chunk
 
 
