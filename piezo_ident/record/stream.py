@@ -167,7 +167,7 @@ class LossCount:
         self._last: list[int] = []
 
     def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of a number; `alone` if one publisher gave all numbers so far."""
+        """Take note of a number; `alone` if its publisher is the only one, and gave the last."""
         before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)

@@ -261,7 +261,7 @@ def _segments(arrays: Mapping[str, Any], path: Path) -> tuple[list[str], Any]:
 
 @contextmanager
 def damage_as_data_error(path: Path, kind: str, cure: str) -> Iterator[None]:
-    """Turn any error of a reader over a damaged file, or else another kind, into one line."""
+    """Turn any error of a reader over a file, damaged or of another `kind`, into one line."""
     try:
         yield
     except DataError:
