@@ -50,14 +50,16 @@ ROOMS = (
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
     'cli': (2100, 11),
-    'common': (1000, 8),
-    'record': (3000, 11),
-    'record/bags': (1300, 5),
-    'record/readings': (1100, 6),
-    'record/tables': (1500, 7),
+    'common': (900, 8),
+    'excitation': (1000, 6),
+    'operators': (1900, 10),
+    'record': (2800, 11),
+    'record/bags': (1100, 4),
+    'record/readings': (1000, 6),
+    'record/tables': (1400, 7),
     'report': (2100, 10),
     'report/figures': (1500, 8),
-    'residual': (2400, 12),
+    'residual': (2200, 12),
 }
 
 # Import names whose rosdep keys read otherwise; a ROS package is its own key.

@@ -55,7 +55,7 @@ def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
     """
     Return numbers with straight lines between usable good ones in place of the bad ones.
 
-    The same array comes back where no number is bad, or no number good.
+    The same array comes back if all numbers are good, or all are bad.
 
     >>> interpolated(np.array([0.0, 9.0, 2.0]), np.array([False, True, False]))
     array([0., 1., 2.])
@@ -83,10 +83,9 @@ def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     Return the smallest and largest of measured numbers, but for wild ones.
 
     Three samples in a row span the range.  One or two samples alone may leave the range by a
-    quarter of its width and four times the usual step from sample to sample; beyond that they are
-    left out.  So the range of sound data, noise included, is that from minimum to maximum.  The
-    parts are samples in the order in which they were taken; without any samples both ends are
-    zero.
+    quarter of its width and four times the usual step from sample to sample; wilder samples are
+    left out.  The range of sound data, noise included, is from minimum to maximum.  The parts are
+    samples in order of time; without any samples both ends are zero.
 
     >>> import numpy as np
     >>> robust_range([np.array([0.0, 0.0, 1.0, 3.0, 3.0, 3.0, 90.0, 2.0, 1.0, 0.0])])

@@ -54,7 +54,7 @@ class ModelError(PiezoIdentError):
 
 
 class IdentificationError(PiezoIdentError):
-    """Data that are sound but do not carry what was asked of them."""
+    """Sound data that lack the information for a result."""
 
 
 class Cancelled(PiezoIdentError):

@@ -77,7 +77,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     """
     Parse a YAML mapping of at most `YAML_SIZE` characters with the safe loader.
 
-    ConfigError, which calls the text by `name`, when it is not YAML, not a mapping, or too large.
+    A ConfigError with the `name` refuses a text that is no YAML mapping, or too large.
 
     >>> parse_yaml('limits: [0, 10]', 'program')
     {'limits': [0, 10]}
@@ -90,7 +90,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
         data = yaml.safe_load(text)
         _count(data, 0, name)
     except (
-        # the loader lets through what its own constructors trip over
+        # the loader passes on the errors of its constructors
         yaml.YAMLError,
         ArithmeticError,
         AttributeError,
@@ -124,10 +124,10 @@ def temporary_output(path: str | Path, *, overwrite: bool = False) -> Iterator[P
     """
     Yield a path of the same file name in a new folder beside `path`; rename it on success.
 
-    A new output gets the rights that the umask gives it, a replaced one keeps its own.  Where
-    `path` is a symbolic link, the file that it leads to is written.  Only with `overwrite` what is
-    there is replaced, a folder only when it is a bag and nothing else.  DataError when the place
-    is taken or cannot be written to; then nothing is left there.
+    A new output gets the rights of the umask, a replaced output keeps its own.  A symbolic link
+    stays, and its target is written.  `overwrite` replaces an older output, and a folder if it is
+    a bag and nothing else.  DataError if the place is taken or cannot be written to; then nothing
+    is left there.
     """
     path = Path(path)
     if path.name in ('', '..'):
@@ -152,9 +152,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 def write_together(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> None:
     """
-    Write several files into a folder: all of them, or none where there is no room.
+    Write several files into a folder: all of them, or none if the disk is full.
 
-    The folder is made when it does not exist; files, contents by name, are put in place in their
+    The folder is made if it does not exist; the files, contents by name, come to their places in
     order.  A folder that cannot be written raises DataError.
     """
     folder = Path(folder)

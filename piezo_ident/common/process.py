@@ -63,7 +63,7 @@ def _receive(channel: Connection) -> Any:
 
 def _end(process: Any, channel: Connection) -> None:
     process.kill()
-    # one that gives way to all others has to wait for a processor even to die
+    # a process that gives way to all others waits for a processor even to die
     process.join(LAST)
     channel.close()
 
@@ -72,8 +72,8 @@ class WorkerProcess:
     """
     A process that does one job at a time and is started again when it has died.
 
-    It ends with the process that made it, however that ends.  `nice` is by how much it gives way
-    to other processes, `warm_up` a function of a module that it calls first.
+    It ends with the process that made it, at any end.  `nice` is its priority below other
+    processes, `warm_up` a function of a module that it calls first.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
@@ -188,7 +188,7 @@ def _serve(channel: Connection, nice: int, warm_up: Callable[[], object] | None)
                 else:
                     cancelled.clear()
                     jobs.put(job)
-        # without a parent there is nothing to do
+        # the parent has gone
         except BaseException:  # noqa: BLE001
             os._exit(0)
 
@@ -230,7 +230,7 @@ def _do(job: Job, channel: Connection, cancelled: threading.Event) -> None:
 
     try:
         message: tuple[str, Any] = ('result', job(tick))
-    # whatever a job raises is for the parent to report
+    # the parent reports the errors of a job
     except Exception as error:  # noqa: BLE001
         message = ('error', error)
     try:

@@ -23,21 +23,11 @@ REQUIRED = object()
 @dataclass(frozen=True)
 class Option:
     """
-    Option of a signal and its allowed values.
+    Option of a signal: its unit, its default, and its allowed values.
 
-    Attributes
-    ----------
-    unit : str
-    default : object
-        `REQUIRED` if the option must be set, None if it may be absent.
-    many : bool
-        Whether a list of numbers is expected; a single number stands for a list of one.
-    whole : bool
-        Whether the numbers must be whole and at least one.
-    positive : bool
-        Whether the numbers must be greater than zero.
-    choices : tuple of str
-        Words to choose from; the option is then a word.
+    The default is `REQUIRED` if the option must be set, and None if it may be absent.  `many`
+    allows a list of numbers, `whole` numbers are at least one, `positive` numbers above zero.  An
+    option with `choices` is one of these words.
     """
 
     unit: str
@@ -48,14 +38,7 @@ class Option:
     choices: tuple[str, ...] = ()
 
     def read(self, value: Any) -> Any:
-        """
-        Check a value and convert it.
-
-        Raises
-        ------
-        ConfigError
-            If the value is of another type, not finite, or out of range.
-        """
+        """Check a value and convert it; ConfigError for another type, or out of range."""
         if self.choices:
             if value not in self.choices:
                 raise ConfigError(f'{reprlib.repr(value)} is none of {", ".join(self.choices)}')
@@ -222,8 +205,7 @@ def _triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
             raise ConfigError(
                 f'preset: paper has its own {" and ".join(own)}; leave out the one or the other'
             )
-        peaks, base, slope = excitation.PAPER_PEAKS, 0.0, excitation.PAPER_SLOPE
-        name = 'paper'
+        peaks, base, slope, name = excitation.PAPER_PEAKS, 0.0, excitation.PAPER_SLOPE, 'paper'
     else:
         base = low if o['base'] is None else o['base']
         # the last peak reaches the end of the range, so that every threshold is excited
@@ -258,16 +240,12 @@ def _decaying_triangle(s: Setting, o: Mapping[str, Any]) -> list[Part]:
 )
 def _minor_loops(s: Setting, o: Mapping[str, Any]) -> list[Part]:
     excitation.sample_count(2 * len(o['biases']) * o['cycles'] / s.sample_rate, s.sample_rate)
-    return [
-        part
-        for bias in o['biases']
-        for part in _periodic(
-            excitation.corners(
-                _about(bias, [o['amplitude']] * o['cycles']), o['slope'], s.sample_rate
-            ),
-            f'minor-{bias:g}{s.unit}',
-        )
-    ]
+    parts = []
+    for bias in o['biases']:
+        levels = _about(bias, [o['amplitude']] * o['cycles'])
+        v = excitation.corners(levels, o['slope'], s.sample_rate)
+        parts += _periodic(v, f'minor-{bias:g}{s.unit}')
+    return parts
 
 
 @_signal(

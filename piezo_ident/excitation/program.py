@@ -108,13 +108,11 @@ class Program:
     limits : tuple of float
         Lowest and highest voltage [V].
     sample_rate : float or None
-        Sampling rate [Hz]; with None the caller chooses it.
+        [Hz]; with None the caller chooses it.
     seed : int
         Seed of the random signals.
-    rest : float
-        Voltage before and after the program [V].
-    slew : float
-        Largest speed of the ramps [V/s].
+    rest, slew : float
+        Voltage before and after the program [V], and largest speed of its ramps [V/s].
     unit : str
         Unit of the levels, V for a voltage; it appears in labels.
 
@@ -141,13 +139,8 @@ class Program:
         """
         Read a program that is shipped, such as ``identification``, or a file of the user.
 
-        Raises
-        ------
-        ConfigError
-            If the file cannot be read, and in the cases of `parse_program`.
+        ConfigError if the file cannot be read, and in the cases of `parse_program`.
 
-        Examples
-        --------
         >>> import piezo_ident as pi
         >>> pi.Program.load('identification').limits
         (0.0, 10.0)
@@ -180,9 +173,7 @@ class Program:
         """
         rate = self.sample_rate if sample_rate is None else float(sample_rate)
         if rate is None or not (math.isfinite(rate) and rate > 0):
-            raise ConfigError(
-                f'{self.name}: sample_rate must be positive; add `sample_rate: 20000`'
-            )
+            raise ConfigError(f'{self.name}: sample_rate must be positive; add `sample_rate: 2e4`')
         low, high = self.limits
         if limits is not None:
             low, high = max(low, limits[0]), min(high, limits[1])
@@ -193,12 +184,8 @@ class Program:
             )
         rng = np.random.default_rng(self.seed) if rng is None else rng
         setting = Setting(rate, (low, high), self.rest, rng, self.unit)
-        return self._join(
-            chain.from_iterable(
-                self._parts(number, entry, setting) for number, entry in enumerate(self.entries, 1)
-            ),
-            setting,
-        )
+        parts = (self._parts(i, entry, setting) for i, entry in enumerate(self.entries, 1))
+        return self._join(chain.from_iterable(parts), setting)
 
     def _parts(self, number: int, entry: Entry, setting: Setting) -> list[tuple[str, Part]]:
         signal, where = SIGNALS[entry.signal], _where(self.name, number, entry.signal)
@@ -302,15 +289,9 @@ def _program(data: Mapping[str, Any], name: str) -> Program:
     items = data.get('segments')
     if not isinstance(items, list) or not items:
         raise ConfigError(f'{name}: segments must be a list with at least one signal')
-    return Program(
-        name=name,
-        entries=tuple(_entry(item, number, name) for number, item in enumerate(items, 1)),
-        limits=(limits[0], limits[1]),
-        sample_rate=values['sample_rate'],
-        seed=int(values['seed']),
-        rest=values['rest'],
-        slew=values['slew'],
-    )
+    entries = tuple(_entry(item, number, name) for number, item in enumerate(items, 1))
+    values |= {'limits': (limits[0], limits[1]), 'seed': int(values['seed'])}
+    return Program(name, entries, **values)
 
 
 def _entry(item: Any, number: int, name: str) -> Entry:

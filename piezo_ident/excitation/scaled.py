@@ -67,8 +67,6 @@ def program_to_yaml(program: Program) -> str:
     """
     Write the text of a program, which `pi.Program.load` reads from a file.
 
-    Examples
-    --------
     >>> import piezo_ident as pi
     >>> from piezo_ident.excitation.program import parse_program
     >>> program = scaled(pi.Program.load('holds'), (0, 120), 10_000)

@@ -84,11 +84,7 @@ def corners(levels: Many[float], slope: float, sample_rate: float) -> Array:
 
 def triangle(peaks: Many[float], base: float, slope: float, sample_rate: float) -> Array:
     """
-    Make triangles from a base to each of the peaks and back.
-
-    Examples
-    --------
-    Equation (7) of the paper: six seconds.
+    Make triangles from a base to each of the peaks and back: eq. (7) of the paper, six seconds.
 
     >>> triangle(PAPER_PEAKS, 0.0, PAPER_SLOPE, 1000.0).size
     6000
@@ -150,20 +146,9 @@ def noise(
     Clipping lowers the peaks and widens the spectrum.  Filtering restores the spectrum and
     slightly raises the peaks.  In turn, both converge.
 
-    Parameters
-    ----------
-    bias, amplitude : float
-        Mean and largest deviation from it [V].
-    cutoff : float
-        End of the flat band [Hz]; a raised cosine falls to zero at 1.2 times this frequency.
-    duration, sample_rate : float
-        Length [s] and sampling rate [Hz].
-    rng : numpy.random.Generator
-        Draws the noise.
-    crest : float, optional
-        Wanted crest factor; about 2 is the smallest possible value.
-    fade : float, optional
-        Time in which the noise rises from the bias and falls back to it [s].
+    The amplitude is the largest deviation from the bias [V].  The band is flat to the cutoff [Hz];
+    a raised cosine falls to zero at 1.2 times this frequency.  A crest factor of about 2 is the
+    smallest possible.  The noise rises from the bias and falls back to it in the time `fade` [s].
     """
     _below_nyquist(cutoff, sample_rate)
     n = sample_count(duration, sample_rate)
@@ -215,18 +200,8 @@ def multisine(
     """
     Make whole periods of a random-phase multisine with equal lines.
 
-    Parameters
-    ----------
-    bias, amplitude : float
-        Mean and largest deviation from it [V].
-    lines : ndarray of int
-        Harmonic numbers of ``1 / period``; see `odd_lines`.
-    period, periods : float, int
-        Length of a period, rounded to a sample [s], and number of periods.
-    sample_rate : float
-        Sampling rate [Hz].
-    rng : numpy.random.Generator
-        Draws the phases.
+    The amplitude is the largest deviation from the bias [V].  The lines are harmonic numbers of
+    ``1 / period``; see `odd_lines`.  The period [s] is rounded to a sample.
     """
     n = sample_count(period, sample_rate)
     sample_count(n * periods / sample_rate, sample_rate)

@@ -270,10 +270,9 @@ class Hysteresis:
         alive = np.maximum(*ends) > nothing
         if self.curves is not None:
             alive |= np.abs(self.curves).max(axis=1, initial=0.0) > nothing
-        curves = None if self.curves is None else self.curves[alive]
-        bias = None if self.bias is None else self.bias[alive]
-        r, q = self.thresholds[alive], self.weights[alive]
-        return replace(self, thresholds=r, weights=q, curves=curves, bias=bias)
+        names = ('thresholds', 'weights', 'curves', 'bias')
+        own: dict[str, Any] = {k: x for k in names if (x := getattr(self, k)) is not None}
+        return replace(self, **{name: x[alive] for name, x in own.items()})
 
     def scaled(self, gain: float) -> Hysteresis:
         """Multiply H by a gain >= 0."""

@@ -40,8 +40,7 @@ def play_columns(v: ArrayLike, thresholds: ArrayLike, memory: ArrayLike | None =
     [[0.0, 0.75, 0.0]]
     """
     x = np.ascontiguousarray(v, dtype=np.float64)
-    # a copy, as a frozen array would be another type to the compiler
-    r = np.array(thresholds, dtype=np.float64)
+    r = np.array(thresholds, dtype=np.float64)  # a frozen array would be another type
     start = initial_memory(float(x[0]), r) if memory is None else np.array(memory, np.float64)
     out = np.empty((r.size, x.size))
     plays(x, r, start, out)

@@ -97,10 +97,10 @@ def assemble(
     if not table.t.size:
         raise DataError(f'{name}: no sample has all its numbers; record again')
     table, epochs = in_order(table, name, met)
-    unit = options.displacement_unit or 'm'
-    if unit != 'm':
+    factor = unit_factor('y', options.displacement_unit or 'm')
+    if factor != 1.0:
         moved = {k: x for k, x in table.columns.items() if k == 'y' or role_of(k) == 'y'}
-        scaled = {k: x / unit_factor('y', unit) for k, x in moved.items()}
+        scaled = {k: x / factor for k, x in moved.items()}
         table = replace(table, columns={**table.columns, **scaled})
     _check_limits(table, options.voltage_limits, name)
     _check_ranges(table, options, name)
@@ -116,14 +116,12 @@ def _table(
     channels: Mapping[str, ArrayLike],
     name: str,
 ) -> OrderedRows:
-    columns = {}
+    columns: dict[str, Array] = {}
     if taken := {'t', 'v', 'y'} & channels.keys():
         raise DataError(f'{name}: a further channel is called {min(taken)}; give it another name')
     for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
-        if values is None:
-            continue
         try:
-            columns[key] = np.asarray(values, dtype=np.float64)
+            columns |= {} if values is None else {key: np.asarray(values, dtype=np.float64)}
         except (TypeError, ValueError):
             raise DataError(f'{name}: column {key!r} holds something else than numbers') from None
     shapes = {k: x.shape for k, x in columns.items()}
@@ -169,13 +167,12 @@ def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> Ordered
             f'{name}: {alone} of {finite.size} displacements are NaN or infinite, in {places} '
             'places; cut the bad stretch out of the file, or all rows without a displacement'
         )
-    missing = unmeasured | ~finite
-    where = at_times(table.t[missing & np.isfinite(table.t)])
+    where = at_times(table.t[(unmeasured | ~finite) & np.isfinite(table.t)])
     action = 'cut out' if bad else 'left out, its voltage is kept'
     met.append(Fault('not_finite', where, bad + alone, f'{action}, record split there'))
     if alone:
-        columns = {**table.columns, 'y': np.where(unmeasured, np.nan, y)}
-        table = replace(table, columns=columns)
+        y = np.where(unmeasured, np.nan, y)
+        table = replace(table, columns={**table.columns, 'y': y})
     rows = np.flatnonzero(finite)
     torn = np.flatnonzero(np.diff(rows) > 1) + 1
     return replace(table.take(rows), torn=torn)

@@ -22,7 +22,7 @@ import re
 
 import numpy as np
 from piezo_ident.common.arrays import Array, frozen_array
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, naming
 from piezo_ident.record.options import plain_unit, UNITS
 from piezo_ident.record.record import Piece, Record
 
@@ -146,11 +146,11 @@ class Axes:
         names = {
             role: (role, *sorted(k for k in piece.channels if role_of(k) == role)) for role in 'vy'
         }
-        for name in (*names['v'], *names['y']):
-            known = np.isfinite(columns[name])
-            if name in names['y'] and not known.any():
+        for name in names['y']:
+            if not np.isfinite(columns[name]).any():
                 raise DataError(f'{name}: the displacement is not known; record it too')
-            if name in names['v'] and not known.all():
+        for name in names['v']:
+            if not np.isfinite(columns[name]).all():
                 raise DataError(f'{name}: the voltage is not known at every sample; record it too')
         inputs, outputs = (
             frozen_array(np.column_stack([columns[k] for k in names[role]])) for role in 'vy'
@@ -170,16 +170,15 @@ class Axes:
         found: list[Axes] = []
         for record in records:
             for piece in record:
-                try:
+                with naming(record.name):
                     axes = cls.of(piece)
-                except DataError as error:
-                    raise DataError(f'{record.name}: {error}') from None
                 found.append(axes)
                 first = found[0]
                 if axes._names != first._names:
+                    own, others = ', '.join(axes._names), ', '.join(first._names)
                     raise DataError(
-                        f'{record.name}: has {", ".join(axes._names)}, and another record or '
-                        f'piece {", ".join(first._names)}; give records of the same axes'
+                        f'{record.name}: has {own}, and another record or piece {others}; give '
+                        'records of the same axes'
                     )
                 if abs(axes.sample_rate / first.sample_rate - 1.0) > 1e-9:
                     raise DataError(

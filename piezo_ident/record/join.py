@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, CHUNK, Integers, Mask
-from piezo_ident.common.errors import DataError, OrderError
+from piezo_ident.common.errors import DataError, naming, OrderError
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.blocks import HELD, RAMPED
 from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
@@ -71,10 +71,8 @@ def record_of_streams(
         key: s for key, s in streams.items() if key not in sparse and not key.startswith(APPLIED)
     }
     guarded = {key: applied_key(key) for key in needed if applied_key(key) in streams}
-    try:
+    with naming(name):
         joined = join(needed, {key: streams[key] for key in guarded.values()})
-    except DataError as error:
-        raise DataError(f'{name}: {error}') from None
     met = [*faults, *sparse.values(), *joined.faults]
     for key, applied in guarded.items():
         met += _driven_alone(applied, streams[applied])

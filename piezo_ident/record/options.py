@@ -89,9 +89,10 @@ class ReadOptions:
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)
         if self.rate is not None:
-            expect(self.rate, Real, 'rate', 'give the samples a second, as in 20e3')
-        if self.rate is not None and not (self.rate > 0 and math.isfinite(self.rate)):
-            raise DataError(f'a rate of {self.rate:g} Hz; give the samples a second, as in 20e3')
+            cure = 'give the samples a second, as in 20e3'
+            expect(self.rate, Real, 'rate', cure)
+            if not (self.rate > 0 and math.isfinite(self.rate)):
+                raise DataError(f'a rate of {self.rate:g} Hz; {cure}')
         for role, name in self.named.items():
             if not re.fullmatch(r't|v|y|segment|[vyx]_\w{1,60}', role, re.ASCII):
                 raise DataError(

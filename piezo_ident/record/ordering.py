@@ -152,9 +152,9 @@ def _stretches(
 def not_uniform(t: Array, breaks: int, name: str) -> DataError:
     """Return the error for times that do not belong to a sampling clock."""
     return DataError(
-        f'{name}: time is not uniformly sampled ({breaks} breaks in {t.size} samples); if the '
-        f'samples came at one rate and none is missing, name it, as in {_mean_rate(t)}, and t is '
-        'not read; else write t with more decimals, or resample on a uniform grid'
+        f'{name}: time is not uniformly sampled ({breaks} breaks in {t.size} samples); name the '
+        f'rate if no sample is missing, as in {_mean_rate(t)}; else write t with more decimals '
+        'or on a uniform grid'
     )
 
 

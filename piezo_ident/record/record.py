@@ -25,8 +25,8 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
 
 #: the segment kinds that the programs use; other labels are kept and treated as unlabelled
-KINDS = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase', 'multisine')
-KINDS += ('ramp', 'idle')
+KINDS: tuple[str, ...] = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase')
+KINDS += ('multisine', 'ramp', 'idle')
 
 
 @dataclass(frozen=True)
@@ -125,9 +125,8 @@ class Piece:
                     f'neighbour or leaves the piece of {v.size} samples'
                 )
             end = s.stop
-        object.__setattr__(self, 'v', v)
-        object.__setattr__(self, 'y', y)
-        object.__setattr__(self, 'channels', MappingProxyType(channels))
+        for name, value in {'v': v, 'y': y, 'channels': MappingProxyType(channels)}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def n(self) -> int:
@@ -193,7 +192,7 @@ class Piece:
 
         Each part keeps the voltage and channels of the run before it; a lone sample is no part.
         """
-        marks = [0, *(mark for run in runs for mark in run), self.n]
+        marks = [0, *itertools.chain.from_iterable(runs), self.n]
         if len(marks) == 2:
             return [self]
         parts: list[Piece] = []

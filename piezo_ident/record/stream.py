@@ -11,6 +11,7 @@ hour then needs no memory of its own, and is an ordinary array to the rest of th
 from __future__ import annotations
 
 from array import array
+import copy
 import tempfile
 from typing import BinaryIO
 
@@ -64,12 +65,9 @@ class BlockStream:
 
     def copy(self) -> BlockStream:
         """Return the stream as it is now."""
-        other = BlockStream()
-        other.n = self.n
-        other._chunks, other._newest = self._chunks[:], self._newest[:]
-        other._rows = self._rows
-        other._sizes, other._arrivals = self._sizes[:], self._arrivals[:]
-        other._segments = self._segments[:]
+        other = copy.copy(self)
+        for name in ('_chunks', '_newest', '_sizes', '_arrivals', '_segments'):
+            setattr(other, name, getattr(self, name)[:])
         return other
 
     def drop(self, n: int) -> int:
@@ -141,8 +139,9 @@ class BlockStream:
         names: list[str] = []
         starts: list[int] = []
         row = 0
+        # blocks have samples, and blocks of a segment share its label
         for label, size in zip(self._segments, self._sizes, strict=True):
-            if size and not (names and names[-1] == label):
+            if not names or names[-1] != label:
                 names.append(label)
                 starts.append(row)
             row += size
@@ -168,7 +167,7 @@ class LossCount:
         self._last: list[int] = []
 
     def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of a number; `alone` if one publisher gave all numbers so far."""
+        """Take note of a number; `alone` if its publisher is the only one, and gave the last."""
         before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)

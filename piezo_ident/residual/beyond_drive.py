@@ -61,9 +61,9 @@ def drive_functions(v: Array, rate: float) -> Array:
     """
     Return functions of a drive that may sum up to a hysteresis, a lag or a creep, shape (n, k).
 
-    The functions are the drive v, shape (n,), its square and cube, its plays, and the plays times
-    the drive, which let loops lean.  Each comes with its first and second difference, and behind
-    low-passes.
+    The functions are the drive v, shape (n,), its square and cube, its plays, and every second
+    play times the drive, which lets loops lean.  Each comes with its first and second difference,
+    and behind low-passes.
     """
     span = float(np.ptp(v))
     u = (v - v.min()) / span if span > 0.0 else np.zeros(v.size)

@@ -139,7 +139,7 @@ def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
     difference = part.e[s.start + 2 * p : s.stop] - part.e[s.start + p : s.stop - p]
     frame = min(max(p, round(FRAME * rate)), difference.size)
     order = ORDER if frame > 16 * ORDER else 0
-    basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, frame), order)
+    basis = np.asarray(np.polynomial.legendre.legvander(np.linspace(-1, 1, frame), order), float)
     series = _detrended(difference, frame, basis) / np.sqrt(2.0)
     # longer means would compare the end of one period with the start of the next
     return _reading(part, series, frame, min(p // 2, frame // 16), ORDER + 1)

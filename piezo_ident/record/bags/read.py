@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.record.bags.recover import (
     Bag,
-    damage_as_data_error,
+    DAMAGED,
     is_unfinished,
     metadata,
     scanned_bag,
@@ -37,6 +37,7 @@ from piezo_ident.record.join import APPLIED, record_of_streams
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Fault, Record
 from piezo_ident.record.stream import BlockStream
+from piezo_ident.record.tables.arrays import damage_as_data_error
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import get_typestore, Stores
@@ -72,7 +73,7 @@ def opened_bag(path: str | Path, *, in_file_order: bool = False) -> Iterator[Bag
     if storage_of(path) == '.db3' and any(c in str(path) for c in '?#%'):
         raise DataError(f'{path}: rosbags cannot open names with ?, # or %; rename it')
     with ExitStack() as stack:
-        with damage_as_data_error(path):
+        with damage_as_data_error(path, *DAMAGED):
             is_packed = path.is_file() and path.suffix != storage_of(path)
             scan = is_unfinished(path) or is_packed or in_file_order
             bag = scanned_bag(path, stack) if scan else _finished(path, stack)
@@ -96,7 +97,7 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
 
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
         if connections:  # rosbags takes no connection for all connections
-            with damage_as_data_error(path):
+            with damage_as_data_error(path, *DAMAGED):
                 stored = itertools.starmap(Stored, reader.messages([*connections]))
                 yield from unpacked(stored, path)
 
@@ -128,7 +129,7 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
     options = replace(options or ReadOptions(), **choices)
     topics: dict[str, str] = {}
 
-    def read(bag: Bag) -> tuple[int, _Blocks]:
+    def read(bag: Bag) -> tuple[int, tuple[dict[str, BlockStream], LogClock]]:
         if bag.faults and not options.recover:
             raise DataError(
                 f'{path}: {bag.faults[0].where}: the bag is unfinished or damaged; '
@@ -136,16 +137,22 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
             )
         asked = {'voltage': options.voltage_topic, 'displacement': options.displacement_topic}
         topics.update(topics or _choose(carried_quantities(bag), asked, options.namespace, path))
-        blocks = _Blocks(bag, topics)
-        return blocks.back, blocks
+        streams, clock = {quantity: BlockStream(spooled=True) for quantity in topics}, LogClock()
 
-    with ordered_bag(path, read) as (bag, blocks):
+        def kept() -> Iterator[tuple[str, Samples]]:
+            for quantity, samples, stamp in blocks_in(bag, topics):
+                streams[quantity].append(samples, clock.rising(quantity, stamp))
+                yield quantity, samples
+
+        return steps_back(kept()), (streams, clock)
+
+    with ordered_bag(path, read) as (bag, (streams, clock)):
         return record_of_streams(
-            blocks.streams,
+            streams,
             name=str(path),
             options=options,
             sample_rate=_sample_rate(path),
-            faults=(*bag.faults, *blocks.clock.faults),
+            faults=(*bag.faults, *clock.faults),
         ).renamed(path.name)
 
 
@@ -202,21 +209,6 @@ class LogClock:
         return (fault,) if self.steps else ()
 
 
-class _Blocks:
-    """The streams of some topics of a bag by quantity, and the steps `back` of their blocks."""
-
-    def __init__(self, bag: Bag, topics: Mapping[str, str]) -> None:
-        self.streams = {quantity: BlockStream(spooled=True) for quantity in topics}
-        self.clock, self.back = LogClock(), 0
-
-        def kept() -> Iterator[tuple[str, Samples]]:
-            for quantity, samples, stamp in blocks_in(bag, topics):
-                self.streams[quantity].append(samples, self.clock.rising(quantity, stamp))
-                yield quantity, samples
-
-        self.back = steps_back(kept())
-
-
 def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
     """Return the number of blocks that begin before the end of the block before."""
     ends: dict[str, float] = {}
@@ -244,7 +236,7 @@ def _messages(bag: Bag, connections: list[Connection]) -> Iterator[tuple[str, in
     for connection, stamp, raw in bag.messages(connections):
         if stamp >= 2**63:
             raise DataError(f'{bag.path}: damaged, a message on {connection.topic} has no time')
-        with damage_as_data_error(bag.path):
+        with damage_as_data_error(bag.path, *DAMAGED):
             message = typestore().deserialize_cdr(raw, connection.msgtype)
         yield connection.topic, stamp, message
 
@@ -308,7 +300,7 @@ def _topic_of(
     if asked is not None:
         topic = f'/{asked.lstrip("/")}'
         if carried.get(topic) != quantity:
-            has = f'{topic} carries {carried[topic]}, not {quantity}'
+            has = f'{topic} carries {carried.get(topic)}, not {quantity}'
             fault = has if topic in carried else f'no samples on topic {topic}'
             raise DataError(f'{path}: {fault}; topics with samples: {topics}')
         return topic

@@ -13,7 +13,7 @@ compressed files into copies.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import closing, contextmanager, ExitStack
+from contextlib import closing, ExitStack
 from dataclasses import dataclass
 import heapq
 import itertools
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import check_regular, load_yaml
 from piezo_ident.record.record import Fault
-from piezo_ident.record.tables.arrays import library
+from piezo_ident.record.tables.arrays import damage_as_data_error, library
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag2,
@@ -88,20 +88,8 @@ def storage_of(path: Path) -> str:
     return found['storage'].lower() if found else ''
 
 
-@contextmanager
-def damage_as_data_error(path: Path) -> Iterator[None]:
-    """Turn any error of a reader over a damaged bag into a `DataError` that names the bag."""
-    try:
-        yield
-    except DataError:
-        raise
-    # damage surfaces in a reader as anything from an assertion to a zstd error
-    except Exception as error:  # noqa: BLE001
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise DataError(
-            f'{path}: damaged or unfinished bag ({reason[:200]}); record it again, or try '
-            "'ros2 bag reindex' and 'mcap recover'"
-        ) from None
+#: arguments of `damage_as_data_error` for bags
+DAMAGED = 'unfinished bag', "record it again, or try 'ros2 bag reindex' and 'mcap recover'"
 
 
 def metadata(folder: Path) -> dict[str, Any]:
@@ -147,18 +135,16 @@ def _storage_files(path: Path) -> list[Path]:
 
 def _is_cut_off(file: Path) -> bool:
     size = file.stat().st_size
-    if file.suffix == '.mcap':
-        with file.open('rb') as stream:
-            stream.seek(max(0, size - len(_MAGIC)))
-            return stream.read() != _MAGIC
+    with file.open('rb') as stream:
+        head = stream.read(100)
+        stream.seek(max(0, size - len(_MAGIC)))
+        tail = stream.read()
     if file.suffix == '.db3':
-        with file.open('rb') as stream:
-            head = stream.read(100)
         page = int.from_bytes(head[16:18], 'big')
         # 1 stands for 65536
         whole = (65536 if page == 1 else page) * int.from_bytes(head[28:32], 'big')
         return bool(_sidecars(file)) or size < whole
-    return False
+    return file.suffix == '.mcap' and tail != _MAGIC
 
 
 def _sidecars(file: Path) -> list[Path]:
@@ -201,7 +187,7 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
 
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
         wanted = {(c.topic, c.msgtype) for c in connections}
-        with damage_as_data_error(path):
+        with damage_as_data_error(path, *DAMAGED):
             every = itertools.chain.from_iterable(part.messages() for part in parts)
             keys = ((m, (m.connection.topic, m.connection.msgtype)) for m in every)
             yield from unpacked(

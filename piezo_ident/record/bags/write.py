@@ -5,24 +5,21 @@
 Bags: a whole record, or messages as they arrive, which are on disk soon after.
 
 rosbags itself keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until
-the bag is closed.  rosbags also writes its own name for the distribution, and no hash of the type
-into an mcap channel.  The calls that end a chunk or a transaction early, and the storage to which
-`JazzyWriter` adds name and hash, are internals of rosbags: `setup.py` bounds the version.
+the bag is closed.  The calls that end a chunk or a transaction early are internals of rosbags:
+`BagWriter` looks for them before the first message, and `setup.py` bounds the version.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
-from io import BytesIO
 import os
 from pathlib import Path
 import sqlite3
 from typing import Any, cast
 
 from piezo_ident.common.errors import DataError
-from piezo_ident.common.files import temporary_output, unwritable, write_text
+from piezo_ident.common.files import temporary_output, unwritable
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.blocks import BLOCK_SIZE, cut_blocks, encode, Samples
 from piezo_ident.record.channels import quantity_of_channel
@@ -36,12 +33,10 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import storage_mcap, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-#: the message types belong to this distribution
-DISTRIBUTION = 'jazzy'
 #: most numbered names that are tried
 NAMES = 10_000
 
@@ -58,46 +53,6 @@ SAMPLE_QOS = Qos(
     liveliness_lease_duration=_FOREVER,
     avoid_ros_namespace_conventions=False,
 )
-
-
-class JazzyWriter(Writer):
-    """Writer of bags with the distribution and the type hashes that rosbag2 of Jazzy writes."""
-
-    def open(self) -> None:
-        """Open the bag, and put the additions between it and its storage."""
-        super().open()
-        storage: Any = self.storage
-        close = storage.close
-        storage.close = lambda version, metadata: close(version, _named(metadata))
-        if self.storage_plugin == StoragePlugin.MCAP:
-            storage.add_connection = partial(_add_channel, storage, storage.add_connection)
-        else:
-            storage.conn.execute('UPDATE schema SET ros_distro = ?', (DISTRIBUTION,))
-
-    def close(self) -> None:
-        """Finish the bag, and name the distribution in its metadata."""
-        super().close()
-        write_text(self.metapath, _named(self.metapath.read_text('utf8')))
-
-
-def _named(metadata: str) -> str:
-    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
-
-
-def _add_channel(
-    storage: Any, add: Callable[[Connection, str], None], connection: Connection, qos: str
-) -> None:
-    """Add a channel whose metadata hold the hash of the type beside the QoS."""
-    chunk, begin = storage.chunk.bio, storage.chunk.bio.tell()
-    add(connection, qos)
-    metadata = BytesIO()
-    metadata.write(storage.channels[-1].metadata)
-    for text in ('topic_type_hash', connection.digest):
-        storage_mcap.write_string(metadata, text)
-    storage.channels[-1] = storage.channels[-1]._replace(metadata=metadata.getvalue())
-    # written once more, longer
-    chunk.seek(begin)
-    storage_mcap.write_channel(chunk, storage.channels[-1], storage.schemas)
 
 
 def knows_type(name: str) -> bool:
@@ -177,7 +132,7 @@ class BagWriter:
         for topic in self._topics:
             self._connect(topic)
 
-    def _opened(self) -> JazzyWriter:
+    def _opened(self) -> Writer:
         path, begin = self._path, self._number + 1 if self.parts else 0
         # from the last number on: a week has more parts than tried names
         for number in range(begin, begin + NAMES):
@@ -185,7 +140,7 @@ class BagWriter:
             try:
                 if os.path.lexists(place):
                     continue
-                writer = JazzyWriter(place, version=9, storage_plugin=STORAGES[self._storage])
+                writer = Writer(place, version=9, storage_plugin=STORAGES[self._storage])
                 writer.open()
             except WriterError:
                 continue  # another recorder was faster
@@ -328,7 +283,7 @@ def write_bag(
     with temporary_output(path, overwrite=overwrite) as target:
         folder = target.with_name('bag') if suffix else target
         plugin = STORAGES[suffix or storage or 'mcap']
-        with JazzyWriter(folder, version=9, storage_plugin=plugin) as writer:
+        with Writer(folder, version=9, storage_plugin=plugin) as writer:
             for key, value in custom.items():
                 writer.set_custom_data(key, value)
             _write_pieces(writer, record, block_size)
@@ -336,9 +291,17 @@ def write_bag(
             next(f for f in folder.iterdir() if f.suffix == path.suffix).replace(target)
 
 
-def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
+def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
+    store = typestore()
+    types: Any = store.types
+    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
     further = dict.fromkeys(quantity_of_channel(k) for p in record for k in p.channels)
-    senders = {q: _sender(writer, q) for q in ('voltage', 'displacement', *further)}
+    connections = {
+        q: writer.add_connection(
+            f'/{q}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
+        )
+        for q in ('voltage', 'displacement', *further)
+    }
     shift, latest = 0, 0.0
     for piece in record:
         columns = {'voltage': piece.v, 'displacement': piece.y}
@@ -357,21 +320,7 @@ def _write_pieces(writer: JazzyWriter, record: Record, block_size: int) -> None:
                     f'{2**63 / 1e9:.4g} s; write .csv or .npz, or let t begin at zero'
                 )
             for quantity, x in columns.items():
-                senders[quantity](Samples(t, x[start:stop], label, quantity), stamp)
-
-
-def _sender(writer: JazzyWriter, quantity: str) -> Callable[[Samples, int], None]:
-    store = typestore()
-    types: Any = store.types
-    dimension = types['std_msgs/msg/MultiArrayDimension']
-    layout, message = types['std_msgs/msg/MultiArrayLayout'], types[MESSAGE_TYPE]
-    connection = writer.add_connection(
-        f'/{quantity}', MESSAGE_TYPE, typestore=store, offered_qos_profiles=[SAMPLE_QOS]
-    )
-
-    def send(samples: Samples, stamp: int) -> None:
-        data, dims = encode(samples)
-        filled = message(layout([dimension(*d) for d in dims], 0), data)
-        writer.write(connection, stamp, store.serialize_cdr(filled, MESSAGE_TYPE))
-
-    return send
+                data, dims = encode(Samples(t, x[start:stop], label, quantity))
+                filled = [types['std_msgs/msg/MultiArrayDimension'](*d) for d in dims]
+                raw = store.serialize_cdr(message(layout(filled, 0), data), MESSAGE_TYPE)
+                writer.write(connections[quantity], stamp, raw)

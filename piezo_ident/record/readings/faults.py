@@ -44,8 +44,8 @@ FIRM = 0.03
 WINDOW = 100
 #: least readings of one value in a row of a sensor that hangs
 HELD = 2 * JUMP
-#: repeats are sought in motion that repeats by chance one reading in 1 / CHANCE, and that goes
-#: this share of the stroke a sample
+#: repeats are sought in motion whose readings repeat by chance at most in this share, and that
+#: moves by this share of the stroke a sample
 CHANCE, CREEPS = 0.01, 3e-5
 #: least number of repeats in a moving signal, and least share of the moving samples
 REPEATS, REPEATED = 4, 2e-4

@@ -37,7 +37,7 @@ _HDF5 = b'\x89HDF\r\n\x1a\n'
 
 def read_npz(path: Path, options: ReadOptions) -> RecordTable:
     """Read a NumPy archive; pickled objects are refused, or left alone beside the record."""
-    with _damage(path, 'npz archive', 'save it again with numpy.savez'):
+    with damage_as_data_error(path, 'no npz archive', 'save it again with numpy.savez'):
         with zipfile.ZipFile(path) as archive:
             _check_size(sum(info.file_size for info in archive.infolist()))
         with np.load(path, allow_pickle=False) as archive:
@@ -62,7 +62,7 @@ def read_mat(path: Path, options: ReadOptions) -> RecordTable:
         head = file.read(1024)
     if _HDF5 in (head[:8], head[512:520]) or head.startswith(b'MATLAB 7.3'):
         return read_hdf5(path, options)
-    with _damage(path, 'MATLAB file', 'save it again with save -v7'):
+    with damage_as_data_error(path, 'no MATLAB file', 'save it again with save -v7'):
         needed = None if options.columns else options.needed
         names, arrays, paths = read_variables(path, _USED, needed)
     return _table(arrays, names, path, _renamed(options, paths.items(), arrays))
@@ -100,7 +100,7 @@ def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
             arrays.update({name + end: x for name, x in parts.items()})
 
     cure = 'save it again; MATLAB: save -v7'
-    with _damage(path, 'HDF5 file', cure), h5py.File(path, 'r') as file:
+    with damage_as_data_error(path, 'no HDF5 file', cure), h5py.File(path, 'r') as file:
         visit('', file)
         file.visititems(visit)
     return _table(arrays, arrays, path, options)
@@ -112,7 +112,10 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
     arrays: dict[str, Any] = {}
     periods: dict[str, float] = {}
     paths: list[tuple[str, str]] = []
-    with _damage(path, 'TDMS file', 'write it again'), tdms.TdmsFile.open(path) as file:
+    with (
+        damage_as_data_error(path, 'no TDMS file', 'write it again'),
+        tdms.TdmsFile.open(path) as file,
+    ):
         channels = [channel for group in file.groups() for channel in group.channels()]
         counts = Counter(channel.name for channel in channels)
         _check_size(8 * sum(map(len, channels)))
@@ -140,7 +143,10 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
 def read_parquet(path: Path, options: ReadOptions) -> RecordTable:
     """Read a file of Apache Parquet."""
     parquet = library('pyarrow.parquet', path, 'pyarrow')
-    with _damage(path, 'Parquet file', 'write it again'), parquet.ParquetFile(path) as file:
+    with (
+        damage_as_data_error(path, 'no Parquet file', 'write it again'),
+        parquet.ParquetFile(path) as file,
+    ):
         _check_size(8 * file.metadata.num_rows * file.metadata.num_columns)
         table = file.read()
         columns = zip(table.column_names, table.columns, strict=True)
@@ -254,15 +260,16 @@ def _segments(arrays: Mapping[str, Any], path: Path) -> tuple[list[str], Any]:
 
 
 @contextmanager
-def _damage(path: Path, kind: str, cure: str) -> Iterator[None]:
-    """Turn any error of a parser over damaged bytes into one line."""
+def damage_as_data_error(path: Path, kind: str, cure: str) -> Iterator[None]:
+    """Turn any error of a reader over a file, damaged or of another `kind`, into one line."""
     try:
         yield
     except DataError:
         raise
-    # zip, zlib, struct, numpy and scipy each have errors of their own for the same damage
-    except Exception as error:
+    # damage surfaces as anything from an assertion to an error of zlib or zstd
+    except Exception as error:  # noqa: BLE001
         if isinstance(error, OSError) and error.errno is not None:
-            raise  # the disk's fault, not the file's
+            reason = error.strerror or str(error)
+            raise DataError(f'{path}: cannot be read ({reason}); check the file') from None
         reason = ' '.join(str(error).split()) or type(error).__name__
-        raise DataError(f'{path}: damaged or no {kind} ({reason[:200]}); {cure}') from None
+        raise DataError(f'{path}: damaged or {kind} ({reason[:200]}); {cure}') from None

@@ -113,21 +113,15 @@ def choose(
     if guessed or given or (rate is not None and options.rate is None):
         parts = [] if rate is None else [f't is k / {rate:.9g} Hz by {origin}']
         for role in filter(places.__contains__, 'tvy'):
-            name = (
-                repr(names[places[role]]) if names[places[role]] else f'column {places[role] + 1}'
-            )
+            k = places[role]
+            name = repr(names[k]) if names[k] else f'column {k + 1}'
             plain = f'{next(iter(UNITS[role]))} as no unit is named'
             parts.append(f'{role} is {name} in {units[role] or plain}')
         action = 'guessed; --columns names others' if guessed else 'as named'
         faults.append(Fault('columns', ', '.join(parts), len(parts), action))
-    table = RecordTable(
-        {},
-        ignored=tuple(n for i, n in enumerate(names) if n and i not in used),
-        units={role: unit for role, unit in units.items() if unit},
-        rate=rate,
-        faults=tuple(faults),
-    )
-    return places, table
+    ignored = tuple(n for i, n in enumerate(names) if n and i not in used)
+    named = {role: unit for role, unit in units.items() if unit}
+    return places, RecordTable({}, [], (), ignored, named, rate, tuple(faults))
 
 
 def _exact(
@@ -139,12 +133,9 @@ def _exact(
         here = [i for i, name in enumerate(names) if name == role and i not in barred]
         if len(here) > 1:
             way = f'--columns {role}={here[0] + 1}'
-            raise DataError(
-                f'{path}: column {role} stands there twice; keep one of them, or say which by its '
-                f'number: {way}',
-                options=way,
-            )
-        places |= dict.fromkeys([role][: len(here)], *here)
+            fault = f'column {role} stands there twice; keep one, or name its number'
+            raise DataError(f'{path}: {fault}: {way}', options=way)
+        places.update((role, i) for i in here)
     return places
 
 
@@ -172,12 +163,9 @@ def _guessed(
             # numbers tell equal names apart
             ways = found if len({*found}) == len(found) else [str(i + 1) for i in fitting]
             first, second = (_option(role, way) for way in ways[:2])
-            raise DataError(
-                f'{path}: {len(found)} columns may be the {_QUANTITIES[role]} ({listed(found)}); '
-                f'say which: {first} or {second}',
-                options=first,
-            )
-        guessed |= dict.fromkeys([role][: len(fitting)], *fitting)
+            fault = f'{len(found)} columns may be the {_QUANTITIES[role]} ({listed(found)})'
+            raise DataError(f'{path}: {fault}; say which: {first} or {second}', options=first)
+        guessed.update((role, i) for i in fitting)
     return guessed
 
 
@@ -216,18 +204,16 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     ):
         here = [i for i, way in enumerate(ways) if way == one]
         if len(here) > 1:
-            raise DataError(
-                f'{path}: column {listed([wanted])} stands there twice; say which by its number: '
-                f'--columns {role}={here[0] + 1} or {role}={here[1] + 1}'
-            )
+            option = f'--columns {role}={here[0] + 1} or {role}={here[1] + 1}'
+            fault = f'column {listed([wanted])} stands there twice; say which by its number'
+            raise DataError(f'{path}: {fault}: {option}')
         if here:
             return here[0]
     if is_number:
         return int(wanted) - 1
-    raise DataError(
-        f'{path}: no column {listed([wanted])!r}; --columns {role}=NAME takes one of: '
-        f'{listed(names) or f"1 to {len(names)}"}'
-    )
+    known = listed(names) or f'1 to {len(names)}'
+    fault = f'no column {listed([wanted])!r}; --columns {role}=NAME takes one of'
+    raise DataError(f'{path}: {fault}: {known}')
 
 
 def _group(name: str) -> str:

@@ -101,9 +101,7 @@ def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
     if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
         return False  # decimal commas between blanks
     # the reader meets a spoiled second row; LabVIEW leaves unknown times empty
-    return all(
-        sum(map(is_number, row)) > 1 and (not row[0] or is_number(row[0])) for row in rows[:2]
-    )
+    return all(sum(map(is_number, r)) > 1 and (not r[0] or is_number(r[0])) for r in rows[:2])
 
 
 def _is_table_behind_text(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
@@ -121,14 +119,11 @@ def _above(
     units: list[str] = []
     for i in reversed(filled[-2:]):
         line = lines[i].strip('\r\n')
-        for mark in COMMENT:
-            if line.lstrip().startswith(mark):
-                line = line.strip().lstrip('#%/!').strip()
+        is_comment = line.lstrip().startswith(COMMENT)
+        line = line.strip().lstrip('#%/!').strip() if is_comment else line
         cells = _named(line, separator, need)
-        if not cells:
-            break
         known = all(_is_unit(x) or is_number(x) for x in cells)
-        if not units and known and not all(map(is_number, cells)):
+        if cells and not units and known and not all(map(is_number, cells)):
             units = cells
             continue
         names = cells

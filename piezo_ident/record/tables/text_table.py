@@ -66,20 +66,17 @@ def _parse(lines: Iterator[str], path: Path, options: ReadOptions) -> RecordTabl
         raise DataError(f'{path}: {fault}; save it as a table with a header line t,v,y')
     names = layout.names
     if not names and not options.columns:
-        rate = rate_option(layout.numbers)
-        filled = layout.width - len(layout.empty)
-        way = '--columns ' + ('t=1,v=2,y=3' if filled > 2 else f'v=1,y=2 {rate}')
+        way = f'--columns v=1,y=2 {rate_option(layout.numbers)}'
+        way = '--columns t=1,v=2,y=3' if layout.width - len(layout.empty) > 2 else way
         raise DataError(
-            f'{path}: no header line; say which column is which by their numbers (of '
-            f'{layout.width}): {way}',
+            f'{path}: no header line; name the columns by their numbers, 1 to {layout.width}: '
+            f'{way}',
             options=way,
         )
-    places, table = choose(
-        names or [''] * layout.width, options, path, scalars=layout.numbers, empty=layout.empty
-    )
-    columns, labels, starts = _rows(
-        itertools.chain(head[layout.above :], lines), layout, places, path
-    )
+    every = names or [''] * layout.width
+    places, table = choose(every, options, path, scalars=layout.numbers, empty=layout.empty)
+    rows = itertools.chain(head[layout.above :], lines)
+    columns, labels, starts = _rows(rows, layout, places, path)
     return replace(table, columns=columns, names=labels, starts=starts)
 
 
@@ -92,14 +89,9 @@ def _rows(
     use = range(width) if layout.separator == ',' else sorted({*places.values()})
     number = {*wanted.values()}
     dtype = np.dtype([(f'{i}', float if i in number else object) for i in use])
-    options: dict[str, Any] = {
-        'delimiter': layout.separator,
-        'comments': None,
-        'quotechar': '"',
-        'ndmin': 1,
-        'usecols': None if layout.separator == ',' else [*use],
-        'encoding': 'utf-8',
-    }
+    options: dict[str, Any] = {'delimiter': layout.separator, 'quotechar': '"', 'comments': None}
+    options |= {'ndmin': 1, 'encoding': 'utf-8'}
+    options['usecols'] = None if layout.separator == ',' else [*use]
     parts: list[Any] = []
     names: list[str] = []
     starts: list[int] = []
@@ -119,10 +111,9 @@ def _rows(
         chunk, held = chunk[:end], chunk[end:]
         if chunk:
             for rows, way in itertools.product((chunk, None), ways):
+                rows = rows or _without_comments(chunk)
                 try:
-                    part = np.loadtxt(
-                        rows or _without_comments(chunk), dtype, converters=way, **options
-                    )
+                    part = np.loadtxt(rows, dtype, converters=way, **options)
                 except ValueError:
                     continue
                 break
@@ -189,18 +180,16 @@ def _second(day: str, clock: str) -> int:
 def _whole_rows(lines: Iterator[str]) -> list[str]:
     """Return the next lines, up to the end of a quoted cell; csv.Error without that end."""
     chunk = list(itertools.islice(lines, ROWS))
-
-    def further() -> Iterator[str]:
-        for line in lines:
-            chunk.append(line)
-            yield line
-
-    # numpy takes the rest of a file for a cell without its closing quote
-    if any('"' in line for line in chunk):
-        n = len(chunk)
-        reader = csv.reader(itertools.chain(chunk[:], further()), strict=True)
-        while reader.line_num < n and next(reader, None) is not None:
-            pass
+    quotes = sum(line.count('"') for line in chunk)
+    while quotes % 2:
+        line = next(lines, '')
+        if not line:
+            raise csv.Error('a quoted cell has no end')
+        chunk.append(line)
+        quotes += line.count('"')
+    # numpy drops a quote inside of a cell
+    for _ in csv.reader(chunk if quotes else (), strict=True):
+        pass
     return chunk
 
 
@@ -230,7 +219,13 @@ def _culprit(
             if not is_number(text):
                 below = [r[place] for r in itertools.islice(rows, 100) if len(r) > place]
                 if number == layout.above + 1 and below and not any(map(is_number, below)):
-                    return _all_text(f'{path}: column {title}', text, name, layout)
+                    way = rate_option(layout.numbers) if name == 't' else f'--columns {name}=NAME'
+                    cure = 'give the sampling rate' if name == 't' else 'name another column'
+                    return DataError(
+                        f'{path}: column {title} holds text, {text[:40]!r}, no numbers; {cure}, '
+                        f'as in {way}',
+                        options=way if name == 't' else '',
+                    )
                 cure = 'mend it, or leave the cell empty if there is no reading'
                 if re.fullmatch(r'[-+]?\d{1,3}([.,]\d{3})+([.,]\d*)?', text):
                     cure = 'save it without marks between thousands'
@@ -242,15 +237,6 @@ def _culprit(
                     'and points above it; save it with one of them'
                 )
     return DataError(f'{path}: unreadable rows from line {line}; save it again')
-
-
-def _all_text(column: str, text: str, name: str, layout: Layout) -> DataError:
-    way = rate_option(layout.numbers) if name == 't' else f'--columns {name}=NAME'
-    cure = 'give the sampling rate instead' if name == 't' else 'name another column'
-    return DataError(
-        f'{column} holds text, {text[:40]!r}, no numbers; {cure}, as in {way}',
-        options=way if name == 't' else '',
-    )
 
 
 def write_csv(

@@ -3,13 +3,7 @@
 
 """Bags as a recorder writes them: on disk at every flush, and in parts."""
 
-from contextlib import closing
-import sqlite3
-
 from bag_data import metadata, raw, recording
-from mcap.reader import make_reader
-from mcap.records import Channel
-from mcap.stream_reader import StreamReader
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.bags.read import opened_bag, read_bag, typestore
@@ -131,43 +125,6 @@ def test_unknown_type_is_refused(tmp_path):
     with pytest.raises(DataError, match='type lab_msgs/msg/Odd is not known'):
         writer.add_topic('/odd', 'lab_msgs/msg/Odd')
     writer.abort()
-
-
-# --- as rosbag2 of Jazzy has it ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_distribution_and_hashes_are_those_of_jazzy(tmp_path, storage):
-    # from the message package of Jazzy: std_msgs/msg/Float64MultiArray.json
-    digest = 'RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f'
-    writer = BagWriter(tmp_path / 'bag', storage)
-    writer.add_topic('/voltage', 'std_msgs/msg/Float64MultiArray')
-    writer.flush()
-    writer.add_topic('/preview', 'sensor_msgs/msg/JointState')
-    writer.write('/voltage', 1, raw(Samples(np.arange(3) / RATE, np.ones(3), 'noise', 'voltage')))
-    writer.close()
-    info = metadata(tmp_path / 'bag')
-    assert info['ros_distro'] == 'jazzy'
-    hashes = {
-        t['topic_metadata']['name']: t['topic_metadata']['type_description_hash']
-        for t in info['topics_with_message_count']
-    }
-    assert hashes['/voltage'] == digest
-    if storage == 'sqlite3':
-        with closing(sqlite3.connect(writer.file)) as db:
-            assert db.execute('SELECT ros_distro FROM schema').fetchall() == [('jazzy',)]
-            assert 'ros_distro: jazzy' in db.execute('SELECT metadata FROM metadata').fetchone()[0]
-        return
-    with writer.file.open('rb') as file:
-        summary = make_reader(file).get_summary()
-        assert {
-            c.topic: c.metadata['topic_type_hash'] for c in summary.channels.values()
-        } == hashes
-        assert all('offered_qos_profiles' in c.metadata for c in summary.channels.values())
-    # in the data, too, for who reads a bag that was not finished
-    with writer.file.open('rb') as file:
-        records = [r for r in StreamReader(file).records if isinstance(r, Channel)]
-    assert {c.topic: c.metadata['topic_type_hash'] for c in records} == hashes
 
 
 # --- parts -----------------------------------------------------------------------------------
