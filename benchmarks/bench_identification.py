@@ -12,15 +12,11 @@ All is warm: compiled kernels are loaded before the clock starts.
 
 from __future__ import annotations
 
-import os
-
-# tall, narrow factorisations only get slower on more threads
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 from pathlib import Path
 import time
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program

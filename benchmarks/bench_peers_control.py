@@ -9,13 +9,10 @@ Free run of the whole model beside python-control's simulation of its linear par
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 import warnings
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import filter_arx

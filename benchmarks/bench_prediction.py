@@ -13,14 +13,10 @@ turns, ratios medians of the ratios turn by turn.
 
 from __future__ import annotations
 
-import os
-
-# tall, narrow factorisations only get slower on more threads
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+import alone  # noqa: F401 - one thread of BLAS
 from numba import njit
 import numpy as np
 from piezo_ident.live.predictor import Predictor
