@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+import warnings
 
 import alone  # noqa: F401 - one thread of BLAS
 from numba import njit
@@ -24,6 +25,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
+from scipy.signal import lfilter
 from side_by_side import markdown, ratio, show, take_turns
 
 RUNS = 7
@@ -164,6 +166,27 @@ def table(works: Mapping[str, tuple[Work, int]], runs: int) -> str:
 HEADS = ('', 'samples', 'ns a sample', 'Msamples/s', 'times the hand-fused kernel')
 
 
+def linear_parts(model: StageModel, v: np.ndarray, few: int) -> dict[str, tuple[Work, int]]:
+    """Return how others run G and the delay alone: python-control on the first `few` samples."""
+    import control
+
+    warnings.filterwarnings('ignore', module='control')
+    G, w = model.dynamics, model.hysteresis(model.scaling.u(v))
+    a, b = np.append(1.0, G.a), np.append(np.zeros(model.delay.samples), G.b)
+    # powers of z, highest first, and as many of them above as below
+    size = max(a.size, b.size)
+    numerator, denominator = (np.pad(x, (0, size - x.size)) for x in (b, a))
+    transfer = control.tf(numerator, denominator, 1.0 / model.sample_rate)
+    t = np.arange(few) / model.sample_rate
+    return {
+        'SciPy `lfilter`, G and delay alone': (lambda: lfilter(b, a, w), v.size),
+        'python-control `forced_response`, G and delay alone, in Python': (
+            lambda: control.forced_response(transfer, t, w[:few]),
+            few,
+        ),
+    }
+
+
 def whole_record(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     """Return the table of records in one go."""
     v = voltage(model, n)
@@ -179,6 +202,7 @@ def whole_record(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     }
     works: dict[str, tuple[Work, int]] = {'kernel fused by hand': (lambda: Fused(model)(v), n)}
     works |= {name: (lambda m=m: m.predict_piece(piece), n) for name, m in models.items()}
+    works |= linear_parts(model, v, max(5000, n // 20))
     works['copy of the record (memory)'] = (lambda: v.copy(), n)
     gap = np.abs(Fused(model)(v) - model.predict_piece(piece))[1000:].max() / abs(model.scaling.Y)
     return 'Prediction of a record', (
