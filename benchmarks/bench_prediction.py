@@ -36,25 +36,20 @@ Work = Callable[[], object]
 
 
 @njit(cache=True, nogil=True, fastmath={'reassoc'})
-def h_step(x, r, q, p1, p2, memory):
-    """One sample of H."""
-    w = 0.0
-    for i in range(r.size):
-        f = memory[i]
-        f = x if f > x else f
-        low = x - r[i]
-        f = low if f < low else f
-        memory[i] = f
-        w += q[i] * f
-    return w + (p1 * x * x + p2) * x
-
-
-@njit(cache=True, nogil=True, fastmath={'reassoc'})
 def fused(v, v0, V, r, q, p1, p2, b, a, d, y0, Y, memory, z, line, out):
     """Scale, H, G, delay and scale back, one sample after the other."""
-    m, at = a.size, 0
+    m, n_r, at = a.size, r.size, 0
     for k in range(v.size):
-        w = h_step((v[k] - v0) / V, r, q, p1, p2, memory)
+        x = (v[k] - v0) / V
+        w = 0.0
+        for i in range(n_r):
+            f = memory[i]
+            f = x if f > x else f
+            low = x - r[i]
+            f = low if f < low else f
+            memory[i] = f
+            w += q[i] * f
+        w += (p1 * x * x + p2) * x
         y = z[0] + b[0] * w
         for i in range(m - 1):
             z[i] = z[i + 1] + b[i + 1] * w - a[i] * y
@@ -68,7 +63,16 @@ def fused(v, v0, V, r, q, p1, p2, b, a, d, y0, Y, memory, z, line, out):
 def fused_plays(v, r, q, p1, p2, memory, out):
     """H alone, one sample after the other."""
     for k in range(v.size):
-        out[k] = h_step(v[k], r, q, p1, p2, memory)
+        x = v[k]
+        w = 0.0
+        for i in range(r.size):
+            f = memory[i]
+            f = x if f > x else f
+            low = x - r[i]
+            f = low if f < low else f
+            memory[i] = f
+            w += q[i] * f
+        out[k] = w + (p1 * x * x + p2) * x
 
 
 class Fused:
