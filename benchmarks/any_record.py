@@ -10,11 +10,6 @@ of it: one is fitted, the other judged.  Every record begins at the lowest volta
 
 from __future__ import annotations
 
-import os
-
-# two processes share two cores: threads of BLAS would wait for each other
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -23,6 +18,7 @@ from pathlib import Path
 import time
 import warnings
 
+import alone  # noqa: F401 - one thread of BLAS
 import bouc_wen
 import numpy as np
 from numpy.typing import NDArray

@@ -12,10 +12,6 @@ C.  All works run in turns in one process.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 import ctypes
 from pathlib import Path
@@ -23,6 +19,7 @@ import shutil
 import subprocess
 import tempfile
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 import piezo_ident as pi
 from side_by_side import markdown, ratio, show, take_turns

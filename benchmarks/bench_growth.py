@@ -14,10 +14,6 @@ straight line.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import replace
@@ -29,6 +25,7 @@ import sys
 import tempfile
 import time
 
+import alone  # noqa: F401 - one thread of BLAS
 from bench_inverse import EFFECTS as INVERTED
 from bench_inverse import motion
 import numpy as np

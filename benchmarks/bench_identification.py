@@ -12,15 +12,11 @@ All is warm: compiled kernels are loaded before the clock starts.
 
 from __future__ import annotations
 
-import os
-
-# tall, narrow factorisations only get slower on more threads
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 from pathlib import Path
 import time
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program
@@ -72,30 +68,19 @@ def whole(record: Record, runs: int) -> tuple[str, str]:
 
     works: dict[str, Work] = {name: lambda _, s=s: timed(s) for name, s in ways.items()}
     turns = take_turns(works, runs, warm=works)
-    rows = [
-        [
-            name,
-            seconds(turn.median),
-            f'{min(turn.times):.3g} .. {seconds(max(turn.times))}',
-            seconds(float(np.median([spent for spent, _ in turn.results]))),
-            ratio(turn.median / LIMIT),
-            ratio(record.duration / turn.median),
-            f'{turn.results[0][1]:.3g} %',
-        ]
-        for name, turn in turns.items()
-    ]
+    rows = []
+    for name, turn in turns.items():
+        span = f'{min(turn.times):.3g} .. {seconds(max(turn.times))}'
+        spent = seconds(float(np.median([spent for spent, _ in turn.results])))
+        shares = (ratio(turn.median / LIMIT), ratio(record.duration / turn.median))
+        error = f'{turn.results[0][1]:.3g} %'
+        rows.append([name, seconds(turn.median), span, spent, *shares, error])
     heads = (
-        'way',
-        'median',
-        'from .. to',
-        'time of the processor',
-        f'share of {LIMIT} s',
-        'times faster than the record',
-        'error on samples kept from every fit',
+        *('way', 'median', 'from .. to', 'time of the processor', f'share of {LIMIT} s'),
+        *('times faster than the record', 'error on samples kept from every fit'),
     )
-    return f'Three steps of {record.duration:.1f} s at {record.pieces[0].sample_rate:g} Hz', (
-        markdown(heads, rows)
-    )
+    title = f'Three steps of {record.duration:.1f} s at {record.pieces[0].sample_rate:g} Hz'
+    return title, markdown(heads, rows)
 
 
 def by_steps(record: Record, runs: int) -> tuple[str, str]:

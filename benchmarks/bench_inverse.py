@@ -12,12 +12,9 @@ asked for its own answer to one voltage.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from dataclasses import replace
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.common.arrays import Array

@@ -97,11 +97,7 @@ def contents(out: Path) -> dict[str, bytes]:
 
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:
-    """
-    Return the section of this benchmark.
-
-    `quick`: A few records, once.
-    """
+    """Return titles and texts; fail where the tables of the three places differ."""
     runs, n = (1, 12) if quick else (RUNS, RECORDS)
     cores = len(os.sched_getaffinity(0))
     many = max(2, cores)
@@ -123,15 +119,11 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
             # kernels are compiled on their first call, and the workers import on theirs
             for chosen in options.values():
                 identify(few, folder / 'warm', *chosen)
-            turns = take_turns(
-                {
-                    place: lambda k, place=place: identify(
-                        records, folder / place, *options[place]
-                    )
-                    for place in options
-                },
-                runs,
-            )
+            works = {
+                place: lambda k, p=place, o=chosen: identify(records, folder / p, *o)
+                for place, chosen in options.items()
+            }
+            turns = take_turns(works, runs)
         first, *others = (contents(folder / place) for place in options)
         if any(other != first for other in others):
             raise RuntimeError('the tables of the three places differ')

@@ -13,11 +13,6 @@ another noise of the sensor.  Free runs of all models are done by the same filte
 
 from __future__ import annotations
 
-import os
-
-# one thread for all: tall, narrow factorisations only get slower on more
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 import contextlib
 from dataclasses import dataclass
@@ -26,6 +21,7 @@ import io
 from typing import Any
 import warnings
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import Excerpt

@@ -20,16 +20,14 @@ from measured values; their prediction is judged at full rate like ours.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import os
 from pathlib import Path
 from typing import Any
 import warnings
 
+import alone  # noqa: F401 - one thread of BLAS
 from numba import njit
 import numpy as np
 import piezo_ident as pi

@@ -14,16 +14,12 @@ stops them by itself at the very evaluation; ours looks every hundred iterations
 
 from __future__ import annotations
 
-import os
-
-# one thread for all: the matrices are tiny
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 import contextlib
 from dataclasses import dataclass
 from functools import partial
 import logging
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import prepare

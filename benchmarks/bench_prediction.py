@@ -13,14 +13,11 @@ turns, ratios medians of the ratios turn by turn.
 
 from __future__ import annotations
 
-import os
-
-# tall, narrow factorisations only get slower on more threads
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+import warnings
 
+import alone  # noqa: F401 - one thread of BLAS
 from numba import njit
 import numpy as np
 from piezo_ident.live.predictor import Predictor
@@ -28,6 +25,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
+from scipy.signal import lfilter
 from side_by_side import markdown, ratio, show, take_turns
 
 RUNS = 7
@@ -38,25 +36,20 @@ Work = Callable[[], object]
 
 
 @njit(cache=True, nogil=True, fastmath={'reassoc'})
-def h_step(x, r, q, p1, p2, memory):
-    """One sample of H."""
-    w = 0.0
-    for i in range(r.size):
-        f = memory[i]
-        f = x if f > x else f
-        low = x - r[i]
-        f = low if f < low else f
-        memory[i] = f
-        w += q[i] * f
-    return w + (p1 * x * x + p2) * x
-
-
-@njit(cache=True, nogil=True, fastmath={'reassoc'})
 def fused(v, v0, V, r, q, p1, p2, b, a, d, y0, Y, memory, z, line, out):
     """Scale, H, G, delay and scale back, one sample after the other."""
-    m, at = a.size, 0
+    m, n_r, at = a.size, r.size, 0
     for k in range(v.size):
-        w = h_step((v[k] - v0) / V, r, q, p1, p2, memory)
+        x = (v[k] - v0) / V
+        w = 0.0
+        for i in range(n_r):
+            f = memory[i]
+            f = x if f > x else f
+            low = x - r[i]
+            f = low if f < low else f
+            memory[i] = f
+            w += q[i] * f
+        w += (p1 * x * x + p2) * x
         y = z[0] + b[0] * w
         for i in range(m - 1):
             z[i] = z[i + 1] + b[i + 1] * w - a[i] * y
@@ -70,7 +63,16 @@ def fused(v, v0, V, r, q, p1, p2, b, a, d, y0, Y, memory, z, line, out):
 def fused_plays(v, r, q, p1, p2, memory, out):
     """H alone, one sample after the other."""
     for k in range(v.size):
-        out[k] = h_step(v[k], r, q, p1, p2, memory)
+        x = v[k]
+        w = 0.0
+        for i in range(r.size):
+            f = memory[i]
+            f = x if f > x else f
+            low = x - r[i]
+            f = low if f < low else f
+            memory[i] = f
+            w += q[i] * f
+        out[k] = w + (p1 * x * x + p2) * x
 
 
 class Fused:
@@ -168,6 +170,27 @@ def table(works: Mapping[str, tuple[Work, int]], runs: int) -> str:
 HEADS = ('', 'samples', 'ns a sample', 'Msamples/s', 'times the hand-fused kernel')
 
 
+def linear_parts(model: StageModel, v: np.ndarray, few: int) -> dict[str, tuple[Work, int]]:
+    """Return how others run G and the delay alone: python-control on the first `few` samples."""
+    import control
+
+    warnings.filterwarnings('ignore', module='control')
+    G, w = model.dynamics, model.hysteresis(model.scaling.u(v))
+    a, b = np.append(1.0, G.a), np.append(np.zeros(model.delay.samples), G.b)
+    # powers of z, highest first, and as many of them above as below
+    size = max(a.size, b.size)
+    numerator, denominator = (np.pad(x, (0, size - x.size)) for x in (b, a))
+    transfer = control.tf(numerator, denominator, 1.0 / model.sample_rate)
+    t = np.arange(few) / model.sample_rate
+    return {
+        'SciPy `lfilter`, G and delay alone': (lambda: lfilter(b, a, w), v.size),
+        'python-control `forced_response`, G and delay alone, in Python': (
+            lambda: control.forced_response(transfer, t, w[:few]),
+            few,
+        ),
+    }
+
+
 def whole_record(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     """Return the table of records in one go."""
     v = voltage(model, n)
@@ -183,6 +206,7 @@ def whole_record(model: StageModel, n: int, runs: int) -> tuple[str, str]:
     }
     works: dict[str, tuple[Work, int]] = {'kernel fused by hand': (lambda: Fused(model)(v), n)}
     works |= {name: (lambda m=m: m.predict_piece(piece), n) for name, m in models.items()}
+    works |= linear_parts(model, v, max(5000, n // 20))
     works['copy of the record (memory)'] = (lambda: v.copy(), n)
     gap = np.abs(Fused(model)(v) - model.predict_piece(piece))[1000:].max() / abs(model.scaling.Y)
     return 'Prediction of a record', (

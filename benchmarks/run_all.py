@@ -43,7 +43,6 @@ ORDER = (
     'identification',
     'peers_arx',
     'peers_swarm',
-    'peers_control',
     'peers_hysteresis',
     'growth',
     'many',

@@ -21,9 +21,7 @@ from pathlib import Path
 import re
 import sys
 
-# two threads of BLAS fight over narrow matrices; one process a core is faster
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.diagnosis import diagnose, DiagnosisSettings
 from piezo_ident.effects import find_effect
@@ -340,8 +338,8 @@ def kind_of(row: Row) -> str:
 
 def hidden(row: Row) -> str:
     """Return the one effect that counts, or the fault."""
-    alone = counted(row) if len(row.truth) == 1 and is_candidate(row) else ()
-    return row.fault or ''.join(alone)
+    single = counted(row) if len(row.truth) == 1 and is_candidate(row) else ()
+    return row.fault or ''.join(single)
 
 
 def stage_of(row: Row) -> str:

@@ -12,16 +12,12 @@ motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and
 
 from __future__ import annotations
 
-import os
-
-# tall, narrow factorisations only get slower on more threads
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
 from dataclasses import replace
 from pathlib import Path
 import platform
 import sys
 
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify

@@ -17,12 +17,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from itertools import starmap
-import os
 from pathlib import Path
 import sys
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-
+import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis import diagnose

@@ -27,6 +27,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.metrics import FORMULA
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.report.figures import style
+from side_by_side import markdown
 from truths.differential import bouc_wen_of
 from truths.families import Core, core_of
 from truths.linear import Cascade, delayed, relaxation
@@ -214,17 +215,11 @@ class Row:
     predicted: Array
     tracked: Array
 
-    def cells(self) -> str:
+    def cells(self) -> list[str]:
         """Return the row of the table."""
+        errors = [f'{np.sqrt(np.mean(x**2)):.2f}' for x in (self.predicted, self.tracked)]
         role = 'fast' if self.is_fast else 'slow'
-        errors = [rms(self.predicted), rms(self.tracked)]
-        told = ' | '.join(f'{e:.2f}' for e in errors)
-        return f'| {NAMES[self.axis]} | {role} | {told} | {WANTED[self.axis]:g} |'
-
-
-def rms(x: Array) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(x**2)))
+        return [NAMES[self.axis], role, *errors, f'{WANTED[self.axis]:g}']
 
 
 def wanted_raster(model: pi.MultiAxisModel, fast: int) -> dict[str, Array]:
@@ -259,14 +254,9 @@ def judged(model: pi.MultiAxisModel, fast: int) -> tuple[list[Row], float]:
         y = reached.y if axis == 'y' else reached.channels[axis]
         stroke = np.ptp(goals[axis])
         missed = runs[axis].measured - runs[axis].predicted
-        rows.append(
-            Row(
-                axis,
-                i == fast,
-                100.0 * missed[after_ramp:] / np.ptp(runs[axis].measured),
-                100.0 * (y[drive.lead :] - goals[axis])[counts] / stroke,
-            )
-        )
+        predicted = 100.0 * missed[after_ramp:] / np.ptp(runs[axis].measured)
+        tracked = 100.0 * (y[drive.lead :] - goals[axis])[counts] / stroke
+        rows.append(Row(axis, i == fast, predicted, tracked))
     return rows, took
 
 
@@ -315,29 +305,26 @@ def teach() -> Taught:
 def write(taught: Taught, out: Path, drawn: Path | None) -> None:
     """Judge a model, and write the page and its picture."""
     results = [judged(taught.model, fast) for fast in (0, 1)]
-    rows = [row for some, _ in results for row in some]
-    head = f'| axis | it is | predicted | tracked | asked |\n|{"---|" * 5}\n'
-    page = {
-        'creep': 100 * CREEP * np.log(10.0),
-        'cross': 100 * CROSS,
-        'rate': RATE / 1e3,
-        'noise': 100 * NOISE,
-        'seconds': taught.length,
-        'learn': taught.alone,
-        'move': taught.length - taught.alone,
-        'lines': LINES,
-        'frames': FRAMES,
-        'part': 100 * PART,
-        'length': LENGTH,
-        'middle': 100 * MIDDLE,
-        'formula': FORMULA,
-        'found': '\n'.join(taught.found),
-        'table': head + '\n'.join(row.cells() for row in rows),
-        'invert': results[0][1],
-    }
-    out.write_text(TEXT.format(**page))
+    drawings = [row for some, _ in results for row in some]
+    rows = [row.cells() for row in drawings]
+    told = TEXT.format(
+        creep=100 * CREEP * np.log(10.0),
+        cross=100 * CROSS,
+        rate=RATE / 1e3,
+        noise=100 * NOISE,
+        seconds=taught.length,
+        learn=taught.alone,
+        move=taught.length - taught.alone,
+        **{'lines': LINES, 'frames': FRAMES, 'length': LENGTH, 'formula': FORMULA},
+        part=100 * PART,
+        middle=100 * MIDDLE,
+        found='\n'.join(taught.found),
+        table=markdown(('axis', 'it is', 'predicted', 'tracked', 'asked'), rows),
+        invert=results[0][1],
+    )
+    out.write_text(told)
     if drawn is not None:
-        picture(rows).savefig(drawn, dpi=style.DPI)
+        picture(drawings).savefig(drawn, dpi=style.DPI)
 
 
 def main() -> None:

@@ -41,13 +41,8 @@ FS = 20_000.0
 NODES = ('stage', 'excitation', 'identifier', 'model', 'recorder', 'player')
 #: what four clients call, none of which starts work that is meant
 CALLED = (
-    'identifier/clear',
-    'identifier/cancel',
-    'identifier/save',
-    'excitation/start',
-    'excitation/stop',
-    'recorder/stop',
-    'player/start',
+    *('identifier/clear', 'identifier/cancel', 'identifier/save', 'excitation/start'),
+    *('excitation/stop', 'recorder/stop', 'player/start'),
 )
 #: how long an answer may take on a machine that has much to do [s]
 ANSWERED = 60.0
@@ -140,18 +135,14 @@ def bad_parameters(node: str) -> Iterator[tuple[str, list[Any]]]:
         for name, value in values.items():
             right = {bool: 1, int: 2, float: 3}.get(type(declaration.default))
             if value.type != right or name in ('NaN', 'infinity', 'a huge number'):
-                yield (
-                    f'{name} for {declaration.name}',
-                    [Parameter(name=declaration.name, value=value)],
-                )
+                own = [Parameter(name=declaration.name, value=value)]
+                yield f'{name} for {declaration.name}', own
     text = ParameterValue(type=4, string_value='x' * 1_000_000)
     yield 'an unknown name', [Parameter(name='nobody', value=text)]
     yield 'a name of 1 MB', [Parameter(name='x' * 1_000_000, value=text)]
     number = ParameterValue(type=3, double_value=1.0)
-    yield (
-        '1000 unknown names at once',
-        [Parameter(name=f'x{k}', value=number) for k in range(1000)],
-    )
+    many = [Parameter(name=f'x{k}', value=number) for k in range(1000)]
+    yield '1000 unknown names at once', many
 
 
 def contradiction() -> list[Any]:
@@ -171,16 +162,10 @@ def foreign_models(model: str) -> Iterator[tuple[str, str]]:
     yield 'a list', '[1, 2]'
     yield 'another mapping', 'a: 1'
     yield 'an object', '!!python/object/apply:os.system ["touch /tmp/piezo_ident_was_here"]'
-    first = 'a0: &a0 [x, x]\n'
-    yield (
-        'aliases for 2^60 entries',
-        first + ''.join(f'a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n' for k in range(1, 60)),
-    )
-    yield (
-        'merge keys for 2^40 entries',
-        'a0: &a0 {x: 1}\n'
-        + ''.join(f'a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}]}}\n' for k in range(1, 40)),
-    )
+    more = ''.join(f'a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n' for k in range(1, 60))
+    yield 'aliases for 2^60 entries', f'a0: &a0 [x, x]\n{more}'
+    more = ''.join(f'a{k}: &a{k} {{<<: [*a{k - 1}, *a{k - 1}]}}\n' for k in range(1, 40))
+    yield 'merge keys for 2^40 entries', f'a0: &a0 {{x: 1}}\n{more}'
     yield 'a list in itself', 'a: &a [*a]'
     yield 'depth of 100,000', 'a: ' + '[' * 100_000
     yield 'a number of a million digits', 'a: ' + '9' * 1_000_000
@@ -356,14 +341,9 @@ class Attack:
     def services(self, seconds: float) -> float:
         """Call services as fast as four processes can; return calls answered a second."""
         command = [sys.executable, str(HERE), '--client', str(seconds)]
+        pipe, own = subprocess.PIPE, self.g.environment
         running = [
-            subprocess.Popen(
-                command,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                env=self.g.environment,
-                text=True,
-            )
+            subprocess.Popen(command, stdout=pipe, stderr=pipe, env=own, text=True)
             for _ in range(4)
         ]
         try:
@@ -425,18 +405,8 @@ def main() -> int:
     from rows import write_rows
 
     with Graph() as g:
-        folder = g.folder / 'out'
-        attack = start(
-            g,
-            {
-                'stage': {'seed': 3},
-                'excitation': {},
-                'identifier': {},
-                'model': {},
-                'recorder': {'output': str(folder)},
-                'player': {},
-            },
-        )
+        given = {'stage': {'seed': 3}, 'recorder': {'output': str(g.folder / 'out')}}
+        attack = start(g, {node: given.get(node, {}) for node in NODES})
         for k in range(args.rounds):
             attack.blocks(k, 500)
             attack.messages(5_000_000 if k == 0 else 1000)

@@ -241,8 +241,7 @@ def drive(program: str) -> int:
     from lab_graph import Client
     from piezo_ident.nodes.wire import PREVIEW
 
-    lost: list[int] = [0]
-    captured: list[int] = [0]
+    lost, captured = [0], [0]
 
     def keep(message: DiagnosticArray) -> None:
         for status in message.status:
@@ -276,20 +275,16 @@ def drive(program: str) -> int:
         time.sleep(0.5)
         status = client.status('identifier')
         report = json.loads(reports[-1]) if reports else {}
-        print(
-            json.dumps(
-                {
-                    'state': status['state'],
-                    'message': status['text'],
-                    'captured': captured[-1],
-                    'lost': lost[-1],
-                    'faults': [f['name'] for f in report.get('data_faults', [])],
-                    'model': models[-1] if models else '',
-                    'seconds': round(seconds, 2),
-                }
-            ),
-            flush=True,
-        )
+        end = {
+            'state': status['state'],
+            'message': status['text'],
+            'captured': captured[-1],
+            'lost': lost[-1],
+            'faults': [f['name'] for f in report.get('data_faults', [])],
+            'model': models[-1] if models else '',
+            'seconds': round(seconds, 2),
+        }
+        print(json.dumps(end), flush=True)
     return 0
 
 
@@ -302,10 +297,8 @@ def seen_from(discovery: str) -> dict[str, list[str]]:
     with Hosts(discovery) as hosts:
         if not discovery:
             del hosts.environment['ROS_AUTOMATIC_DISCOVERY_RANGE']
-        looks = [
-            hosts.start(k, [sys.executable, str(HERE), '--look', str(k)], f'look{k}')
-            for k in (0, 1)
-        ]
+        command = [sys.executable, str(HERE), '--look']
+        looks = [hosts.start(k, [*command, str(k)], f'look{k}') for k in (0, 1)]
         found = [look.communicate(timeout=LIMIT)[0] for look in looks]
         errors = [(hosts.folder / f'look{k}.err').read_text()[-500:] for k in (0, 1)]
     if not all(found):

@@ -22,8 +22,9 @@ from .families import SEALED
 from .motion import POORER
 from .table import EFFECTS, OUTSIDE
 
-#: of the stages that are sums of plays; nobody looked at the first ones before they were judged
-SUM_SEEDS = {'sums': (21, 22, 23), 'first-sums': (1, 2, 3)}
+#: of the stages that are sums of plays, and the first of twenty seeds of those without an effect;
+#: nobody looked at those of `sums` before they were judged
+SUM_SEEDS = {'sums': ((21, 22, 23), 41), 'first-sums': ((1, 2, 3), 1)}
 COLOURS = ('white', '1/f', '10-bit')
 PAIRS = (
     ('creep', 'rate_dependent_hysteresis'),
@@ -99,11 +100,11 @@ class SumCase:
 
 def sum_cases(group: str = 'sums') -> Iterator[SumCase]:
     """Yield every case of a group of `SUM_SEEDS`, the telling ones first."""
-    seeds = SUM_SEEDS[group]
-    for seed in seeds:
+    seeds, first = SUM_SEEDS[group]
+    for k, seed in enumerate(seeds):
         for effect in EFFECTS:
             yield SumCase('one', (effect,), 0.3, seed)
-        for number in range(seed, seeds[0] + 20, len(seeds)):
+        for number in range(first + k, first + 20, len(seeds)):
             for noise in COLOURS:
                 yield SumCase('none', (), 0.0, number, noise)
         for effect in EFFECTS:

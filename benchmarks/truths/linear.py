@@ -12,7 +12,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.signal import firwin, freqz, lfilter
+from scipy.signal import firwin, lfilter
 
 from .cores import Array, Rng
 
@@ -139,17 +139,8 @@ class ARX:
 
     def __call__(self, u: Array) -> Array:
         """Return the answer from rest at zero."""
-        b, a = self._coefficients()
-        return np.asarray(lfilter(b, a, u))
-
-    def response(self, frequency: Array) -> NDArray[np.complex128]:
-        """Return the complex gain at frequencies [Hz], shape (n,)."""
-        return np.asarray(freqz(*self._coefficients(), worN=frequency, fs=RATE)[1])
-
-    @staticmethod
-    def _coefficients() -> tuple[Array, Array]:
         a, b = np.array([1.0, *PAPER_A]), np.array(PAPER_B)
-        return b * a.sum() / b.sum(), a
+        return np.asarray(lfilter(b * a.sum() / b.sum(), a, u))
 
 
 @dataclass(frozen=True)

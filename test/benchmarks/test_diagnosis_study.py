@@ -26,7 +26,7 @@ from truths import (
 from truths.linear import Linear
 from truths.sizes import size_of
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / 'benchmarks'
 
 
