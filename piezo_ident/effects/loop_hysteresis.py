@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 import math
 
 import numpy as np
@@ -24,23 +25,23 @@ REPEATED = 3
 PHASE = 0.05
 #: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
 RESONATES = math.sqrt(0.5)
-#: laws that are tried: shares of the stiffness that slip over the swing, and half widths of plays
-#: as shares of the swing (taste: they span a decade, and a fit moves what it needs)
-SLIPS, WIDTHS = (1.0, 10.0), (0.03, 0.1, 0.3)
+#: laws that are tried: slip over the swing, and its skew, by which a loop softens (above -1) or
+#: hardens (taste: a fit moves both)
+SLIPS, SKEWS = (3.0, 6.0), (0.0, -1.5)
 
 
 @part_of_kernels
-def _slipped(s: float, way: float, gamma: float, delta: float, power: float) -> float:
+def _slipped(s: float, way: float, gamma: float, skew: float, power: float) -> float:
     # the law of Bouc and Wen along a short way, by its midpoint
-    if gamma == 0.0 and delta == 0.0:
+    if gamma == 0.0:
         return s + way
-    side = gamma if way > 0.0 else -gamma
+    side = 1.0 if way > 0.0 else -1.0
     half = s
     for share in (0.5, 1.0):
         size = abs(half)
         if power != 1.0:
             size = size**power
-        half = s + share * way * (1.0 - (delta + (side if half > 0.0 else -side)) * size)
+        half = s + share * way * (1.0 - gamma * (skew + (side if half > 0.0 else -side)) * size)
     return half
 
 
@@ -53,7 +54,7 @@ def run_loop(
 
     `step` is the sub-step of q and p, each with the inputs at its begin and end.  `spring` holds
     elastic, viscous, power, and the number of sub-steps.  The rows of `elements` are stiffness,
-    threshold, gamma and delta.  `state` holds the last two inputs, q and p of the linear mode and
+    threshold, gamma and skew.  `state` holds the last two inputs, q and p of the linear mode and
     of the difference, and the force; `memory` the play and the slip of each element.
     """
     count = int(spring[3])
@@ -128,12 +129,12 @@ _STEP = """
                 double way, half = s->slip[i];
                 play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
                 way = play[i] - s->play[i];
-                if (gamma[i] == 0.0 && delta[i] == 0.0)
+                if (gamma[i] == 0.0)
                     half += way;
                 else
                     for (m = 0; m < 2; m++) {
-                        const double side = way > 0.0 ? gamma[i] : -gamma[i];
-                        const double bent = delta[i] + (half > 0.0 ? side : -side);
+                        const double side = way > 0.0 ? 1.0 : -1.0;
+                        const double bent = gamma[i] * (skew[i] + (half > 0.0 ? side : -side));
                         half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
                     }
                 slip[i] = half;
@@ -189,11 +190,11 @@ class LoopHysteresis(Effect):
     the position at rest:
 
         q'' + 2 zeta w q' + w^2 q = w^2 (x - h),    h = elastic q + viscous q' / w + sum_i k_i s_i,
-        s_i' = e_i' - gamma_i |e_i'| |s_i|^(n-1) s_i - delta_i e_i' |s_i|^n,
+        s_i' = e_i' - gamma_i (|e_i'| |s_i|^(n-1) s_i + skew_i e_i' |s_i|^n),
 
     and e_i is the output of a play of half width r_i that q drives.  The signal behind the effect
     is x - h, and G remains the linear part.  An element with r = 0 is the law of Bouc and Wen, and
-    a lag along the path (Dahl) if delta = 0, too.  With gamma = delta = 0 it is a play.
+    a lag along the path (Dahl) if skew = 0, too.  With gamma = 0 it is a play.
     `elastic` and `viscous` return to G what G had absorbed of the mean stiffness and damping.
 
     Notes
@@ -220,15 +221,15 @@ class LoopHysteresis(Effect):
         Parameter('viscous', '1', 'change of the damping 2 zeta', 0.0, -2.0, 2.0, step=1e-3),
         Parameter('stiffness', '1', 'stiffness k_i', 0.0, -3.0, 3.0, vector=True, step=1e-3),
         Parameter('threshold', 'span', 'half width r_i', NAN, 0.0, 10.0, True, 0.0, scale='fixed'),
-        Parameter('gamma', 'span^-n', 'gamma_i', NAN, -1e3, 1e3, vector=True, default=0.0),
-        Parameter('delta', 'span^-n', 'delta_i', NAN, -1e3, 1e3, vector=True, default=0.0),
+        Parameter('gamma', 'span^-n', 'slip gamma_i', NAN, 0.0, 1e4, True, 0.0, scale='log'),
+        Parameter('skew', '1', 'skew_i, delta over gamma', NAN, -10.0, 10.0, True, 0.0),
         Parameter('power', '1', 'power n', NAN, 0.5, 4.0, default=1.0, scale='fixed'),
     )
 
     def prepare(self) -> None:
         """Compute the sub-step."""
         self._silent = self.is_neutral(self.values)
-        rows = [self.array(name) for name in ('stiffness', 'threshold', 'gamma', 'delta')]
+        rows = [self.array(name) for name in ('stiffness', 'threshold', 'gamma', 'skew')]
         self._elements = np.ascontiguousarray(np.array(rows).T)
         stiffest = 1.0 + abs(self.number('elastic')) + float(np.abs(rows[0]).sum())
         frequency, damping = self.number('frequency'), self.number('damping')
@@ -259,11 +260,13 @@ class LoopHysteresis(Effect):
             return ()
         frequency, damping = min(excited)
         mode = {'frequency': frequency, 'damping': damping}
-        swing = view.span / (2.0 * damping)
-        wide = np.array(WIDTHS) * swing
-        laws = [{'gamma': [g / swing], 'stiffness': [0.0]} for g in SLIPS]
-        laws.append({'threshold': wide, 'stiffness': np.zeros(wide.size)})
-        return tuple(cls.trial({**mode, **law}) for law in laws)
+        # a sine at the resonance swings so much further than its command; all other motion does
+        # not, and the start of a fit lies between
+        swing = view.span / math.sqrt(2.0 * damping)
+        return tuple(
+            cls.trial({**mode, 'gamma': [slip / swing], 'skew': [skew], 'stiffness': [0.0]})
+            for slip, skew in product(SLIPS, SKEWS)
+        )
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest: the spring is relaxed, and the signal passes."""
@@ -285,7 +288,7 @@ class LoopHysteresis(Effect):
         if self._silent:
             return CCode()
         elastic, viscous, power, count = self._spring.tolist()
-        names = ('stiffness', 'threshold', 'gamma', 'delta')
+        names = ('stiffness', 'threshold', 'gamma', 'skew')
         n = self._elements.shape[0]
         numbers: Numbers = {'n': n, 'count': int(count), 'to_q': self._step[0]}
         numbers |= {'to_p': self._step[1], 'elastic': elastic, 'viscous': viscous, 'power': power}
