@@ -105,57 +105,75 @@ def run_loop(
     state[6] = h
 
 
-# the loop of `run_loop` for one sample
-_STEP = """
+# the slip of element i of a spring at q, as in `_slipped`; the result is in `play` and `slip`
+_SLIP = """
+    double way, half = s->slip[i];
+    play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
+    way = play[i] - s->play[i];
+    if (gamma[i] == 0.0)
+        half += way;
+    else
+        for (m = 0; m < 2; m++) {
+            const double side = way > 0.0 ? 1.0 : -1.0;
+            const double bent = gamma[i] * (skew[i] + (half > 0.0 ? side : -side));
+            half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
+        }
+    slip[i] = half;
+    force += stiffness[i] * half;
+"""
+_REST = """
 {
-    const double w0 = x - s->rest;
-    const double slope = 0.5 * (3.0 * w0 - 4.0 * s->w1 + s->w2);
-    const double bend = 0.5 * (w0 - 2.0 * s->w1 + s->w2);
+    const double q = x / (1.0 + elastic);
+    int i;
+    for (i = 0; i < n; i++) {
+        s->play[i] = q;
+        s->slip[i] = 0.0;
+    }
+    s->w1 = s->w2 = s->l[0] = x;
+    s->l[1] = s->d[1] = 0.0;
+    s->h = elastic * q;
+    s->d[0] = -s->h;
+    x -= s->h;
+}
+"""
+# one sample of `run_loop`
+_STEP = f"""
+{{
+    const double slope = 0.5 * (3.0 * x - 4.0 * s->w1 + s->w2);
+    const double bend = 0.5 * (x - 2.0 * s->w1 + s->w2);
     double play[COUNT], slip[COUNT], begin = s->w1;
     int i, j, k, m;
-    for (j = 0; j < count; j++) {
+    for (j = 0; j < count; j++) {{
         const double tau = (j + 1.0) / count - 1.0;
-        const double end = w0 + tau * (slope + tau * bend);
+        const double end = x + tau * (slope + tau * bend);
         const double *const l = s->l, *const d = s->d;
         const double m0 = to_q[0] * l[0] + to_q[1] * l[1] + to_q[2] * begin + to_q[3] * end;
         const double m1 = to_p[0] * l[0] + to_p[1] * l[1] + to_p[2] * begin + to_p[3] * end;
         const double e0 = to_q[0] * d[0] + to_q[1] * d[1] - to_q[2] * s->h;
         const double e1 = to_p[0] * d[0] + to_p[1] * d[1] - to_p[2] * s->h;
         double force = s->h;
-        for (k = 0; k < REPEATED; k++) {
+        for (k = 0; k < {REPEATED}; k++) {{
             const double q = m0 + e0 - to_q[3] * force, p = m1 + e1 - to_p[3] * force;
             force = elastic * q + viscous * p;
-            for (i = 0; i < n; i++) {
-                double way, half = s->slip[i];
-                play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
-                way = play[i] - s->play[i];
-                if (gamma[i] == 0.0)
-                    half += way;
-                else
-                    for (m = 0; m < 2; m++) {
-                        const double side = way > 0.0 ? 1.0 : -1.0;
-                        const double bent = gamma[i] * (skew[i] + (half > 0.0 ? side : -side));
-                        half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
-                    }
-                slip[i] = half;
-                force += stiffness[i] * half;
-            }
-        }
+            for (i = 0; i < n; i++) {{
+                {_SLIP}
+            }}
+        }}
         s->l[0] = piezo_alive(m0);
         s->l[1] = piezo_alive(m1);
         s->d[0] = piezo_alive(e0 - to_q[3] * force);
         s->d[1] = piezo_alive(e1 - to_p[3] * force);
         s->h = force;
         begin = end;
-        for (i = 0; i < n; i++) {
+        for (i = 0; i < n; i++) {{
             s->play[i] = play[i];
             s->slip[i] = slip[i];
-        }
-    }
+        }}
+    }}
     s->w2 = s->w1;
-    s->w1 = w0;
+    s->w1 = x;
     x -= s->h;
-}
+}}
 """
 
 
@@ -186,8 +204,7 @@ class LoopHysteresis(Effect):
 
     The force of the spring acts back on the motion that causes it, so the effect lies inside the
     loop of the mechanics and changes stiffness and damping with the amplitude.  H, in front of the
-    mechanics, cannot do this.  With q the deflection of the mode of G at w = 2 pi frequency, from
-    the position at rest:
+    mechanics, cannot do this.  With q the deflection of the mode of G at w = 2 pi frequency:
 
         q'' + 2 zeta w q' + w^2 q = w^2 (x - h),    h = elastic q + viscous q' / w + sum_i k_i s_i,
         s_i' = e_i' - gamma_i (|e_i'| |s_i|^(n-1) s_i + skew_i e_i' |s_i|^n),
@@ -269,19 +286,23 @@ class LoopHysteresis(Effect):
         )
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: the spring is relaxed, and the signal passes."""
-        self._rest = x0
+        """Come to rest: no element has slipped."""
         self._state, self._memory = np.zeros(7), np.zeros((self._elements.shape[0], 2))
-        return x0
+        if self._silent:
+            return x0
+        q = x0 / (1.0 + self.number('elastic'))
+        force = self.number('elastic') * q
+        self._memory[:, 0] = q
+        self._state[:] = x0, x0, x0, 0.0, -force, 0.0, force
+        return x0 - force
 
     def process(self, block: Block) -> Block:
         """Subtract the force of the spring."""
         if self._silent:
             return block
-        out = np.empty(block.x.size)
-        x = block.x - self._rest
-        run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, out)
-        return block.with_signal(block.x - out)
+        force, x = np.empty(block.x.size), np.ascontiguousarray(block.x)
+        run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, force)
+        return block.with_signal(x - force)
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
@@ -294,20 +315,6 @@ class LoopHysteresis(Effect):
         numbers |= {'to_p': self._step[1], 'elastic': elastic, 'viscous': viscous, 'power': power}
         numbers |= dict(zip(names, self._elements.T, strict=True))
         size = 'fabs(half)' if power == 1.0 else 'pow(fabs(half), power)'
-        return CCode(
-            numbers,
-            f'double rest, w1, w2, l[2], d[2], h, play[{n}], slip[{n}];\n',
-            """
-{
-    int i;
-    s->rest = x;
-    s->w1 = s->w2 = s->h = 0.0;
-    s->l[0] = s->l[1] = s->d[0] = s->d[1] = 0.0;
-    for (i = 0; i < n; i++)
-        s->play[i] = s->slip[i] = 0.0;
-}
-""",
-            _STEP.replace('SIZE', size)
-            .replace('COUNT', str(n))
-            .replace('REPEATED', str(REPEATED)),
-        )
+        state = f'double w1, w2, l[2], d[2], h, play[{n}], slip[{n}];\n'
+        step = _STEP.replace('SIZE', size).replace('COUNT', str(n))
+        return CCode(numbers, state, _REST, step)
