@@ -41,6 +41,8 @@ VISIBLE = {
         'damping': 0.05,
         'elastic': -0.1,
         'viscous': -0.02,
+        'square': -0.05,
+        'cubic': 0.1,
         'stiffness': [0.2, 0.1],
         'threshold': [0.0, 0.05],
         'gamma': [0.8, 0.0],

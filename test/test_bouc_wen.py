@@ -3,7 +3,6 @@
 
 """A quick part of the study of hysteretic springs: a short record and few candidates."""
 
-
 import warnings
 
 import bouc_wen as study
@@ -22,9 +21,7 @@ CANDIDATES = pi.DiagnosisSettings(effects=('loop_hysteresis', 'changed_dynamics'
 
 def surrogate(u, y, frequency, damping):
     """Return the linear model of a mode, with the numerator that fits best."""
-    pole = np.exp(
-        2 * np.pi * frequency / study.RATE * (-damping + 1j * np.sqrt(1 - damping**2))
-    )
+    pole = np.exp(2 * np.pi * frequency / study.RATE * (-damping + 1j * np.sqrt(1 - damping**2)))
     a = np.array([-2 * pole.real, abs(pole) ** 2])
     low, high = float(u.min()), float(u.max())
     ringing = lfilter([1.0], [1.0, *a], u)
