@@ -41,10 +41,12 @@ VISIBLE = {
         'damping': 0.05,
         'elastic': -0.1,
         'viscous': -0.02,
+        'square': -0.05,
+        'cubic': 0.1,
         'stiffness': [0.2, 0.1],
         'threshold': [0.0, 0.05],
         'gamma': [0.8, 0.0],
-        'delta': [-1.1, 0.0],
+        'skew': [-1.4, 0.0],
     },
     'noncongruent_minor_loops': {'threshold': [0.03, 0.2], 'slope': [0.04, -0.02], 'bias': 0.4},
     'periodic_disturbance': {

@@ -34,7 +34,7 @@ from piezo_ident.diagnosis.messages import (
     warnings_of,
 )
 from piezo_ident.diagnosis.refined_model import refine, Refined
-from piezo_ident.diagnosis.refits import law_of, refits, walk
+from piezo_ident.diagnosis.refits import law_of, refits, walk, with_numerator
 from piezo_ident.diagnosis.results import (
     Diagnosis,
     DiagnosisSettings,
@@ -231,7 +231,7 @@ def _diagnosed(
         progress('verdict', 0.5)
 
     decision = decide(candidates)
-    last = walk(simulator, given, candidates, decision.best, tick)
+    last = with_numerator(simulator, walk(simulator, given, candidates, decision.best, tick))
     untried = set(catalogue()) - set(names) - have
     findings = judge(candidates, decision, last, shown, wide.mean_square, untried)
     # noise of single samples that the averaging to rows removes

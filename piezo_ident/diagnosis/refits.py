@@ -22,13 +22,18 @@ from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equat
 from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.fit_steps import BaseColumns
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.polishing import POLISH, POLISHING
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import means
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.toward_given import toward_given
+from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 
+#: taps of a new numerator of G: the first comes so many samples earlier, as the delay may have
+#: imitated the effect; and the fewest (physics: a mode needs three, and a filter behind it one)
+EARLIER, LEAST_TAPS = 3, 4
 #: laws of H that are wider than plays: one with loops that are not congruent, one with lags, too
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
 
@@ -172,6 +177,40 @@ def _steps(
         if known_g is None or law_of(known_g) != law_of(wide):
             known_g = with_g(simulator, wide)
         yield Step('wide', known_g)
+
+
+def with_numerator(simulator: Simulator, step: Step) -> Step:
+    """
+    Fit the numerator of G again, in turn with all else, beside an effect in the loop of G.
+
+    An identification without the effect has distorted G.  The effect itself moves the mode, so
+    the poles stay.  The result is the given step if its error falls by less than a `POLISH`.
+    """
+    best = step
+    if not any(added.effect.contains for added in step.fitted.state.effects):
+        return step
+    for _ in range(POLISHING):
+        state = _with_other_numerator(simulator, best.fitted.state)
+        fitted = fit_jointly(simulator, state, base_at(simulator, state))
+        if not fitted.mean_square <= (1.0 - POLISH) * best.fitted.mean_square:
+            break
+        best = replace(best, fitted=fitted)
+    return best
+
+
+def _with_other_numerator(simulator: Simulator, state: State) -> State:
+    rows, model = simulator.rows, simulator.model
+    G, delay = model.dynamics, model.delay.samples
+    first = max(0, delay - EARLIER)
+    taps = range(first, max(delay + G.b.size + 1, first + LEAST_TAPS))
+    ringing = [filter_arx(G.a, np.ones(1), x) for x in simulator.into_g(state)]
+    columns = [rows.of([Delay(k).apply(x) for x in ringing]) for k in taps]
+    added = simulator.added_columns(state)
+    whole = np.column_stack([*columns, added])
+    theta = np.linalg.lstsq(whole, rows.x, rcond=None)[0]
+    linear = Dynamics(G.a, theta[: len(taps)]), Delay(first)
+    state = replace(state, retuning=(), linear=linear)
+    return state.with_only_added(theta[len(taps) :])
 
 
 def law_of(fitted: Fitted) -> LawName:

@@ -90,12 +90,12 @@ class Simulator:
     def model_of(self, state: State, record: int = 0) -> StageModel:
         """Return the model of a state, with the parameters of the effects in one record."""
         settings = [EffectSetting(a.name, a.values[record]) for a in state.effects]
+        G, delay = state.linear or (self.model.dynamics, self.model.delay)
         return replace(
             self.model,
             hysteresis=state.hysteresis,
-            dynamics=retuned(
-                self.model.dynamics, state.retuning, self.model.sample_rate, self._band
-            ),
+            dynamics=retuned(G, state.retuning, self.model.sample_rate, self._band),
+            delay=delay,
             effects=(*self.model.effects, *settings),
         )
 
@@ -196,6 +196,13 @@ class Simulator:
         if self._kept is not None and self._kept.state is state:
             return self._kept.prediction
         return self._predicted(state, self._of_runs(lambda i: self._chain(state, i).output()))
+
+    def into_g(self, state: State) -> list[Array]:
+        """Compute the signal in front of G in each run, normalised."""
+        state = replace(state, retuning=())
+        chains = self._of_runs(lambda i: self._chain(state, i))
+        self._of_runs(lambda i: chains[i].output(keep=True))
+        return [chain.blocks[place_of(None, chain.operators)].x for chain in chains]
 
     def full(self, state: State) -> list[Array]:
         """Predict each run at the full rate, normalised."""

@@ -14,6 +14,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import with_number
+from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
@@ -71,6 +72,8 @@ class State:
     effects : tuple of Added
     retuning : tuple of float
         Coefficients of `retuned`; empty if G stays unchanged.
+    linear : (Dynamics, Delay) or None
+        G and the delay in the place of those of the model.
     law : HysteresisLaw or None
         The law of H; None if H stays fixed.
     coefficients : ndarray, shape (size,)
@@ -85,6 +88,7 @@ class State:
     offsets: Array
     effects: tuple[Added, ...] = ()
     retuning: tuple[float, ...] = ()
+    linear: tuple[Dynamics, Delay] | None = None
     law: HysteresisLaw | None = None
     coefficients: Array = field(default_factory=lambda: np.empty(0))
     fading: tuple[float, ...] = ()

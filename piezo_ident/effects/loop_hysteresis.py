@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 import math
 
 import numpy as np
@@ -22,25 +23,27 @@ from scipy.linalg import expm
 REPEATED = 3
 #: phase of a mode in a sub-step [rad] (physics: a twentieth of a radian integrates a loop to 1e-3)
 PHASE = 0.05
+#: steps of Newton's method to the bend of a spring at rest (it doubles the digits)
+BENDS = 8
 #: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
 RESONATES = math.sqrt(0.5)
-#: laws that are tried: shares of the stiffness that slip over the swing, and half widths of plays
-#: as shares of the swing (taste: they span a decade, and a fit moves what it needs)
-SLIPS, WIDTHS = (1.0, 10.0), (0.03, 0.1, 0.3)
+#: laws that are tried: slip over the swing, and its skew, by which a loop softens (above -1) or
+#: hardens (taste: a fit moves both)
+SLIPS, SKEWS = (3.0, 6.0), (0.0, -1.5)
 
 
 @part_of_kernels
-def _slipped(s: float, way: float, gamma: float, delta: float, power: float) -> float:
+def _slipped(s: float, way: float, gamma: float, skew: float, power: float) -> float:
     # the law of Bouc and Wen along a short way, by its midpoint
-    if gamma == 0.0 and delta == 0.0:
+    if gamma == 0.0:
         return s + way
-    side = gamma if way > 0.0 else -gamma
+    side = 1.0 if way > 0.0 else -1.0
     half = s
     for share in (0.5, 1.0):
         size = abs(half)
         if power != 1.0:
             size = size**power
-        half = s + share * way * (1.0 - (delta + (side if half > 0.0 else -side)) * size)
+        half = s + share * way * (1.0 - gamma * (skew + (side if half > 0.0 else -side)) * size)
     return half
 
 
@@ -52,34 +55,33 @@ def run_loop(
     Compute the force of the spring at each sample, and carry state and memory on.
 
     `step` is the sub-step of q and p, each with the inputs at its begin and end.  `spring` holds
-    elastic, viscous, power, and the number of sub-steps.  The rows of `elements` are stiffness,
-    threshold, gamma and delta.  `state` holds the last two inputs, q and p of the linear mode and
-    of the difference, and the force; `memory` the play and the slip of each element.
+    elastic, viscous, power, the number of sub-steps, square and cubic.  The rows of `elements` are
+    stiffness, threshold, gamma and skew.  `state` holds the last two inputs, q and p of the linear
+    mode and of the difference, and the force, all from rest; then input, q and force at rest.
+    `memory` holds the play and the slip of each element.
     """
     count = int(spring[3])
-    a, c, power = spring[0], spring[1], spring[2]
+    a, c, power, square, cubic = spring[0], spring[1], spring[2], spring[4], spring[5]
     w1, w2, l0, l1, d0, d1 = state[0], state[1], state[2], state[3], state[4], state[5]
-    h = state[6]
+    h, rest_x, rest_q, rest_h = state[6], state[7], state[8], state[9]
     new = np.empty_like(memory)
     for k in range(x.size):
-        w0 = x[k]
+        w0 = x[k] - rest_x
         # the command between samples: a parabola through the last three
         slope, bend = 0.5 * (3.0 * w0 - 4.0 * w1 + w2), 0.5 * (w0 - 2.0 * w1 + w2)
         begin = w1
         for j in range(count):
             tau = (j + 1.0) / count - 1.0
             end = w0 + tau * (slope + tau * bend)
-            q_old = l0 + d0
             m0 = step[0, 0] * l0 + step[0, 1] * l1 + step[0, 2] * begin + step[0, 3] * end
             m1 = step[1, 0] * l0 + step[1, 1] * l1 + step[1, 2] * begin + step[1, 3] * end
             e0 = step[0, 0] * d0 + step[0, 1] * d1 - step[0, 2] * h
             e1 = step[1, 0] * d0 + step[1, 1] * d1 - step[1, 2] * h
             force = h
-            q = q_old
             for _ in range(REPEATED):
-                q = m0 + e0 - step[0, 3] * force
+                q = rest_q + (m0 + e0 - step[0, 3] * force)
                 p = m1 + e1 - step[1, 3] * force
-                force = a * q + c * p
+                force = q * (a + q * (square + q * cubic)) + c * p
                 for i in range(elements.shape[0]):
                     r = elements[i, 1]
                     play = min(max(memory[i, 0], q - r), q + r)
@@ -92,27 +94,64 @@ def run_loop(
                     )
                     new[i, 0], new[i, 1] = play, slip
                     force += elements[i, 0] * slip
+                force -= rest_h
             l0, l1 = alive(m0), alive(m1)
             d0 = alive(e0 - step[0, 3] * force)
             d1 = alive(e1 - step[1, 3] * force)
             h, begin = force, end
             for i in range(elements.shape[0]):
                 memory[i, 0], memory[i, 1] = new[i, 0], new[i, 1]
-        out[k] = h
+        out[k] = rest_h + h
         w2, w1 = w1, w0
     state[0], state[1], state[2], state[3], state[4], state[5] = w1, w2, l0, l1, d0, d1
     state[6] = h
 
 
-# the loop of `run_loop` for one sample
-_STEP = """
+# the slip of element i of a spring at q, as in `_slipped`; the result is in `play` and `slip`
+_SLIP = """
+    double way, half = s->slip[i];
+    play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
+    way = play[i] - s->play[i];
+    if (gamma[i] == 0.0)
+        half += way;
+    else
+        for (m = 0; m < 2; m++) {
+            const double side = way > 0.0 ? 1.0 : -1.0;
+            const double bent = gamma[i] * (skew[i] + (half > 0.0 ? side : -side));
+            half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
+        }
+    slip[i] = half;
+    force += stiffness[i] * half;
+"""
+_REST = """
 {
-    const double w0 = x - s->rest;
+    double q = x / (1.0 + elastic);
+    int i;
+    for (i = 0; i < BENDS; i++) {
+        const double left = x - q * (1.0 + elastic + q * (square + q * cubic));
+        q += left / (1.0 + elastic + q * (2.0 * square + q * (3.0 * cubic)));
+    }
+    for (i = 0; i < n; i++) {
+        s->play[i] = q;
+        s->slip[i] = 0.0;
+    }
+    s->w1 = s->w2 = s->h = 0.0;
+    s->l[0] = s->l[1] = s->d[0] = s->d[1] = 0.0;
+    s->rest_x = x;
+    s->rest_q = q;
+    s->rest_h = q * (elastic + q * (square + q * cubic));
+    x -= s->rest_h;
+}
+"""
+# one sample of `run_loop`
+_STEP = f"""
+{{
+    const double w0 = x - s->rest_x;
     const double slope = 0.5 * (3.0 * w0 - 4.0 * s->w1 + s->w2);
     const double bend = 0.5 * (w0 - 2.0 * s->w1 + s->w2);
     double play[COUNT], slip[COUNT], begin = s->w1;
     int i, j, k, m;
-    for (j = 0; j < count; j++) {
+    for (j = 0; j < count; j++) {{
         const double tau = (j + 1.0) / count - 1.0;
         const double end = w0 + tau * (slope + tau * bend);
         const double *const l = s->l, *const d = s->d;
@@ -121,40 +160,30 @@ _STEP = """
         const double e0 = to_q[0] * d[0] + to_q[1] * d[1] - to_q[2] * s->h;
         const double e1 = to_p[0] * d[0] + to_p[1] * d[1] - to_p[2] * s->h;
         double force = s->h;
-        for (k = 0; k < REPEATED; k++) {
-            const double q = m0 + e0 - to_q[3] * force, p = m1 + e1 - to_p[3] * force;
-            force = elastic * q + viscous * p;
-            for (i = 0; i < n; i++) {
-                double way, half = s->slip[i];
-                play[i] = piezo_held(s->play[i], q - threshold[i], q + threshold[i]);
-                way = play[i] - s->play[i];
-                if (gamma[i] == 0.0 && delta[i] == 0.0)
-                    half += way;
-                else
-                    for (m = 0; m < 2; m++) {
-                        const double side = way > 0.0 ? gamma[i] : -gamma[i];
-                        const double bent = delta[i] + (half > 0.0 ? side : -side);
-                        half = s->slip[i] + (m ? 1.0 : 0.5) * way * (1.0 - bent * SIZE);
-                    }
-                slip[i] = half;
-                force += stiffness[i] * half;
-            }
-        }
+        for (k = 0; k < {REPEATED}; k++) {{
+            const double q = s->rest_q + (m0 + e0 - to_q[3] * force);
+            const double p = m1 + e1 - to_p[3] * force;
+            force = q * (elastic + q * (square + q * cubic)) + viscous * p;
+            for (i = 0; i < n; i++) {{
+                {_SLIP}
+            }}
+            force -= s->rest_h;
+        }}
         s->l[0] = piezo_alive(m0);
         s->l[1] = piezo_alive(m1);
         s->d[0] = piezo_alive(e0 - to_q[3] * force);
         s->d[1] = piezo_alive(e1 - to_p[3] * force);
         s->h = force;
         begin = end;
-        for (i = 0; i < n; i++) {
+        for (i = 0; i < n; i++) {{
             s->play[i] = play[i];
             s->slip[i] = slip[i];
-        }
-    }
+        }}
+    }}
     s->w2 = s->w1;
     s->w1 = w0;
-    x -= s->h;
-}
+    x -= s->rest_h + s->h;
+}}
 """
 
 
@@ -185,15 +214,15 @@ class LoopHysteresis(Effect):
 
     The force of the spring acts back on the motion that causes it, so the effect lies inside the
     loop of the mechanics and changes stiffness and damping with the amplitude.  H, in front of the
-    mechanics, cannot do this.  With q the deflection of the mode of G at w = 2 pi frequency, from
-    the position at rest:
+    mechanics, cannot do this.  With q the deflection of the mode of G at w = 2 pi frequency:
 
-        q'' + 2 zeta w q' + w^2 q = w^2 (x - h),    h = elastic q + viscous q' / w + sum_i k_i s_i,
-        s_i' = e_i' - gamma_i |e_i'| |s_i|^(n-1) s_i - delta_i e_i' |s_i|^n,
+        q'' + 2 zeta w q' + w^2 q = w^2 (x - h),
+        h = elastic q + square q^2 + cubic q^3 + viscous q' / w + sum_i k_i s_i,
+        s_i' = e_i' - gamma_i (|e_i'| |s_i|^(n-1) s_i + skew_i e_i' |s_i|^n),
 
     and e_i is the output of a play of half width r_i that q drives.  The signal behind the effect
     is x - h, and G remains the linear part.  An element with r = 0 is the law of Bouc and Wen, and
-    a lag along the path (Dahl) if delta = 0, too.  With gamma = delta = 0 it is a play.
+    a lag along the path (Dahl) if skew = 0, too.  With gamma = 0 it is a play.
     `elastic` and `viscous` return to G what G had absorbed of the mean stiffness and damping.
 
     Notes
@@ -206,8 +235,16 @@ class LoopHysteresis(Effect):
 
     name = 'loop_hysteresis'
     slot = 'hidden'
-    # elastic and viscous alone are a linear change of the mode
-    contains = ('amplifier_lag', 'changed_dynamics', 'delay_change', 'input_feedthrough')
+    # elastic and viscous alone are a linear change of the mode; far below it, square and cubic
+    # bend the displacement
+    contains = (
+        'amplifier_lag',
+        'changed_dynamics',
+        'delay_change',
+        'even_nonlinearity',
+        'input_feedthrough',
+        'sensor_nonlinearity',
+    )
     description = (
         'hysteresis in the spring of a mode; its frequency and damping change with the amplitude, '
         'by 1 .. 50 %'
@@ -218,23 +255,26 @@ class LoopHysteresis(Effect):
         Parameter('damping', '1', 'damping ratio of the mode in G', NAN, 1e-5, 1.0, scale='fixed'),
         Parameter('elastic', '1', 'change of the stiffness', 0.0, -0.99, 3.0, step=1e-3),
         Parameter('viscous', '1', 'change of the damping 2 zeta', 0.0, -2.0, 2.0, step=1e-3),
+        Parameter('square', 'span^-1', 'curvature of the force', 0.0, -20.0, 20.0, step=1e-3),
+        Parameter('cubic', 'span^-2', 'hardening of the force', 0.0, -20.0, 20.0, step=1e-3),
         Parameter('stiffness', '1', 'stiffness k_i', 0.0, -3.0, 3.0, vector=True, step=1e-3),
         Parameter('threshold', 'span', 'half width r_i', NAN, 0.0, 10.0, True, 0.0, scale='fixed'),
-        Parameter('gamma', 'span^-n', 'gamma_i', NAN, -1e3, 1e3, vector=True, default=0.0),
-        Parameter('delta', 'span^-n', 'delta_i', NAN, -1e3, 1e3, vector=True, default=0.0),
+        Parameter('gamma', 'span^-n', 'slip gamma_i', NAN, 0.0, 1e4, True, 0.0, scale='log'),
+        Parameter('skew', '1', 'skew_i, delta over gamma', NAN, -10.0, 10.0, True, 0.0),
         Parameter('power', '1', 'power n', NAN, 0.5, 4.0, default=1.0, scale='fixed'),
     )
 
     def prepare(self) -> None:
         """Compute the sub-step."""
         self._silent = self.is_neutral(self.values)
-        rows = [self.array(name) for name in ('stiffness', 'threshold', 'gamma', 'delta')]
+        rows = [self.array(name) for name in ('stiffness', 'threshold', 'gamma', 'skew')]
         self._elements = np.ascontiguousarray(np.array(rows).T)
         stiffest = 1.0 + abs(self.number('elastic')) + float(np.abs(rows[0]).sum())
         frequency, damping = self.number('frequency'), self.number('damping')
         self._step, count = mode_step(frequency, damping, self.sample_rate, stiffest)
         spring = [self.number(name) for name in ('elastic', 'viscous', 'power')]
-        self._spring = np.array([*spring, count])
+        curve = self.number('square'), self.number('cubic')
+        self._spring = np.array([*spring, count, *curve])
 
     @classmethod
     def agree(cls, values: Mapping[str, Value]) -> None:
@@ -259,52 +299,49 @@ class LoopHysteresis(Effect):
             return ()
         frequency, damping = min(excited)
         mode = {'frequency': frequency, 'damping': damping}
-        swing = view.span / (2.0 * damping)
-        wide = np.array(WIDTHS) * swing
-        laws = [{'gamma': [g / swing], 'stiffness': [0.0]} for g in SLIPS]
-        laws.append({'threshold': wide, 'stiffness': np.zeros(wide.size)})
-        return tuple(cls.trial({**mode, **law}) for law in laws)
+        # a sine at the resonance swings so much further than its command; all other motion does
+        # not, and the start of a fit lies between
+        swing = view.span / math.sqrt(2.0 * damping)
+        return tuple(
+            cls.trial({**mode, 'gamma': [slip / swing], 'skew': [skew], 'stiffness': [0.0]})
+            for slip, skew in product(SLIPS, SKEWS)
+        )
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest: the spring is relaxed, and the signal passes."""
-        self._rest = x0
-        self._state, self._memory = np.zeros(7), np.zeros((self._elements.shape[0], 2))
-        return x0
+        """Come to rest: no element has slipped."""
+        self._state, self._memory = np.zeros(10), np.zeros((self._elements.shape[0], 2))
+        if self._silent:
+            return x0
+        elastic, *_, square, cubic = self._spring.tolist()
+        q = x0 / (1.0 + elastic)
+        for _ in range(BENDS):
+            left = x0 - q * (1.0 + elastic + q * (square + q * cubic))
+            q += left / (1.0 + elastic + q * (2.0 * square + q * (3.0 * cubic)))
+        force = q * (elastic + q * (square + q * cubic))
+        self._state[7:] = x0, q, force
+        self._memory[:, 0] = q
+        return x0 - force
 
     def process(self, block: Block) -> Block:
         """Subtract the force of the spring."""
         if self._silent:
             return block
-        out = np.empty(block.x.size)
-        x = block.x - self._rest
-        run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, out)
-        return block.with_signal(block.x - out)
+        force, x = np.empty(block.x.size), np.ascontiguousarray(block.x)
+        run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, force)
+        return block.with_signal(x - force)
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
         if self._silent:
             return CCode()
-        elastic, viscous, power, count = self._spring.tolist()
-        names = ('stiffness', 'threshold', 'gamma', 'delta')
+        elastic, viscous, power, count, square, cubic = self._spring.tolist()
+        names = ('stiffness', 'threshold', 'gamma', 'skew')
         n = self._elements.shape[0]
         numbers: Numbers = {'n': n, 'count': int(count), 'to_q': self._step[0]}
         numbers |= {'to_p': self._step[1], 'elastic': elastic, 'viscous': viscous, 'power': power}
+        numbers |= {'square': square, 'cubic': cubic}
         numbers |= dict(zip(names, self._elements.T, strict=True))
         size = 'fabs(half)' if power == 1.0 else 'pow(fabs(half), power)'
-        return CCode(
-            numbers,
-            f'double rest, w1, w2, l[2], d[2], h, play[{n}], slip[{n}];\n',
-            """
-{
-    int i;
-    s->rest = x;
-    s->w1 = s->w2 = s->h = 0.0;
-    s->l[0] = s->l[1] = s->d[0] = s->d[1] = 0.0;
-    for (i = 0; i < n; i++)
-        s->play[i] = s->slip[i] = 0.0;
-}
-""",
-            _STEP.replace('SIZE', size)
-            .replace('COUNT', str(n))
-            .replace('REPEATED', str(REPEATED)),
-        )
+        state = f'double w1, w2, l[2], d[2], h, rest_x, rest_q, rest_h, play[{n}], slip[{n}];\n'
+        step = _STEP.replace('SIZE', size).replace('COUNT', str(n))
+        return CCode(numbers, state, _REST.replace('BENDS', str(BENDS)), step)
