@@ -49,8 +49,10 @@ ROOMS = (
 
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
-    'cli': (2100, 11),
+    'cli': (2000, 11),
     'common': (1000, 8),
+    'identification': (5000, 20),
+    'many': (800, 6),
     'record': (3000, 11),
     'record/bags': (1300, 5),
     'record/readings': (1100, 6),
