@@ -49,9 +49,11 @@ ROOMS = (
 
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
-    'cli': (2100, 11),
+    'cli': (2000, 11),
     'common': (900, 8),
     'excitation': (1000, 6),
+    'identification': (5000, 20),
+    'many': (800, 6),
     'operators': (1900, 10),
     'record': (2800, 11),
     'record/bags': (1100, 4),

@@ -14,6 +14,8 @@ import signal
 import sys
 from typing import Any, TYPE_CHECKING
 
+from piezo_ident.common.errors import printable
+
 if TYPE_CHECKING:
     from piezo_ident.identification.results import Progress
 
@@ -124,5 +126,5 @@ class _Lines(logging.Handler):
 
 
 def _harmless(text: str) -> str:
-    """Replace control characters, so that names in files cannot steer a terminal."""
-    return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
+    """Replace control characters in each line."""
+    return '\n'.join(map(printable, text.split('\n')))

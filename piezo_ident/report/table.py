@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import math
 import textwrap
 
+from piezo_ident.common.errors import printable
+
 #: of a terminal [characters]
 WIDTH = 99
 #: columns of a table of faults in the data
@@ -51,7 +53,7 @@ class Table:
     def lines(self) -> list[str]:
         """Return the table for a terminal; a last column of text is wrapped."""
         rows = [self.head, *self.rows] if any(self.head) else list(self.rows)
-        cells = [[_printable(cell) for cell in row] for row in rows]
+        cells = [[printable(cell) for cell in row] for row in rows]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         left = [True, *self.text_columns[1:]]
         if left[-1]:
@@ -89,7 +91,7 @@ def listed(names: Iterable[str]) -> str:
 def plain_text(parts: Iterable[Table | str]) -> str:
     """Return tables and paragraphs for a terminal; empty paragraphs are left out."""
     blocks = (
-        part.lines() if isinstance(part, Table) else _wrapped(_printable(part), '')
+        part.lines() if isinstance(part, Table) else _wrapped(printable(part), '')
         for part in parts
         if part
     )
@@ -143,11 +145,6 @@ def origin_tables(
 
 def _is_number(cell: str) -> bool:
     return not cell or (cell[0] in '0123456789-–∞' and len(cell) < 16)
-
-
-def _printable(text: str) -> str:
-    # names in files must not steer a terminal
-    return ''.join(c if c.isprintable() else '?' for c in text)
 
 
 def _wrapped(text: str, indent: str) -> list[str]:

@@ -101,7 +101,7 @@ def drawn_of(result):
 def test_a_model_fitted_to_all_is_not_drawn_as_if_a_part_were_held_out(unlabelled, identified):
     overview = drawn_of(unlabelled)['overview_1']
     error = number(unlabelled.error('held out'))
-    assert f'held out before that was missed by {error} %' in overview.caption
+    assert f'held out before were missed by {error} %' in overview.caption
     assert f'held out before: {error} %' in overview.figure.axes[1].get_title('right')
     assert not overview.figure.axes[1].patches
     # the swarm is not run again, and three steps leave out what they hold out
@@ -120,7 +120,7 @@ def test_what_decides_about_the_delay_is_said(identified):
     response = step.response.copy()
     response[k] = -np.sign(response[-1]) * 3.0 * step.threshold
     found = delay(step=replace(step, response=response))
-    assert 'together with the next one' in found.caption
+    assert 'two samples in a row' in found.caption
     assert 'free run' not in found.caption
     # above the threshold, but no beginning of the response
     assert 1.0 in lines_of(found.figure)['other direction'][:, 0]

@@ -111,7 +111,7 @@ def _overviews(runs: Sequence[PieceRun], refitted: Mapping[str, float]) -> list[
                 ' In the end H was fitted to the whole record; the drawn error is one of the fit. '
                 f'Samples held out before were missed by {error} of stroke.'
             )
-            remark = f'H fitted to all of it; error on samples held out before: {error}'
+            remark = f'H fitted to all of it; error of samples held out before: {error}'
         wanted.append(
             (
                 f'overview_{k}',

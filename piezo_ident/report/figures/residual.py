@@ -16,6 +16,7 @@ from piezo_ident.diagnosis.results import Residual
 from piezo_ident.record.record import Piece
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
+from piezo_ident.report.table import number
 from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
 from scipy import signal
 
@@ -68,7 +69,7 @@ def residual_figure(residual: Residual) -> Figure:
         rows.append(((last,), limit, 'on the same scale'))
     small, _ = style.axis_limit(e[last])
     if 0.0 < small < limit / ENLARGED:
-        rows.append(((last,), small, f'{limit / small:.2g} times enlarged'))
+        rows.append(((last,), small, f'{number(limit / small, 2)} times enlarged'))
     fig = style.figure(1.2 + 1.6 * len(rows))
     ratios = {'height_ratios': [0.8, *[1.5] * len(rows)]}
     axes = fig.subplots(1 + len(rows), 1, sharex=True, gridspec_kw=ratios)

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.errors import printable
 
 # Okabe and Ito's palette: told apart with every common colour vision, and by lightness in grey
 BLACK, BLUE, VERMILION = '#000000', '#0072B2', '#D55E00'
@@ -99,7 +100,7 @@ def png(picture: Figure, dpi: int | None = None) -> bytes:
 
 def safe(text: str, longest: int = 60) -> str:
     """Escape mathematics and control characters in a text, and shorten it."""
-    shown = ''.join(c if c.isprintable() else '?' for c in text)
+    shown = printable(text)
     if len(shown) > longest:
         shown = shown[: longest - 3] + '...'
     return shown.replace('$', r'\$')
