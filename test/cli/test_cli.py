@@ -137,18 +137,10 @@ def test_the_steepest_of_all_axes_is_said(capsys, tmp_path):
     said = json.loads(succeed(capsys, *argv, tmp_path / 'mine.yaml'))
     succeed(capsys, *argv, '--voltage-only', tmp_path / 'both.npz')
     both = np.load(tmp_path / 'both.npz')
+    assert both.files == ['t', 'v', 'v_b', 'segment_name', 'segment_start']
     steepest = [2000.0 * np.abs(np.diff(both[name])).max() for name in ('v', 'v_b')]
     assert steepest[0] < steepest[1] == pytest.approx(said['steepest'])
     assert said['samples'] == both['v'].size
-
-
-def test_voltages_of_several_axes_go_into_one_file(capsys, tmp_path):
-    out = tmp_path / 'both.npz'
-    argv = ['simulate', '--config', 'two_axes', '--program', 'two_axes', '--voltage-only', out]
-    data = json.loads(succeed(capsys, *argv, '--json'))
-    table = np.load(out)
-    assert table.files == ['t', 'v', 'v_b', 'segment_name', 'segment_start']
-    assert table['v_b'].size == data['samples']
 
 
 def test_a_displacement_beside_the_voltages_makes_a_labelled_record(capsys, tmp_path):

@@ -10,7 +10,6 @@ from piezo_ident.identification.results import (
     ErrorRow,
     Identification,
     Settings,
-    silent,
     Steps,
 )
 from piezo_ident.identification.step1_delay import StepDelay
@@ -42,11 +41,6 @@ import pytest
 def test_what_cannot_be_followed_is_refused(wrong, says):
     with pytest.raises(ConfigError, match=says):
         Settings(**wrong)
-
-
-def test_what_can_be_followed_is_taken():
-    assert Settings(order=(3, 2), delay=0, hold_out=0.5, thresholds=10).order == (3, 2)
-    silent('delay', 0.5)
 
 
 def step(samples):
