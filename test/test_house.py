@@ -37,6 +37,7 @@ ROOMS = (
     'identification',
     'axes',
     'diagnosis',
+    'uncertainty',
     'control',
     'export',
     'verbs',
@@ -62,6 +63,7 @@ SIZES = {
     'report': (2100, 10),
     'report/figures': (1500, 8),
     'residual': (2200, 12),
+    'uncertainty': (900, 12),
 }
 
 # Import names whose rosdep keys read otherwise; a ROS package is its own key.
