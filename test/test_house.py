@@ -50,7 +50,7 @@ ROOMS = (
 
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
-    'cli': (2000, 11),
+    'cli': (2100, 11),
     'common': (900, 8),
     'excitation': (1000, 6),
     'identification': (5000, 20),
