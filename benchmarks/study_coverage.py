@@ -290,7 +290,8 @@ def page(rows: Sequence[Covered], parameters: Sequence[tuple[object, ...]], draw
         'nobody had used. `make coverage` writes this page. This run: '
         f'**{len(groups["identified"])} identified stages, {len(groups["diagnosed"])} diagnosed '
         f'ones, {len(measured)} measured records, {draws} draws of parameters**, '
-        f'{sum(bool(r.error) for r in rows)} failed; {machine()}.',
+        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 100. '
+        f'{machine()}.',
         '![Nominal against measured coverage by kind of motion](images/coverage.png)',
     ]
     for what, own in groups.items():
