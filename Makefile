@@ -15,7 +15,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 SOURCED := $(or $(ROS_DISTRO),$(AMENT_PREFIX_PATH))
 MADE := .venv/.made$(if $(SOURCED),-sourced)
 
-.PHONY: any-record attack docs netns soak
+.PHONY: any-record attack coverage docs netns soak
 .PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash limits mirror stays-right study study-xy table-one clean distclean
 .DELETE_ON_ERROR:
@@ -86,6 +86,12 @@ study-xy: .venv/.demo
 # are read from ../shared/data/fsm, or from fsm in PIEZO_IDENT_DATA
 mirror: .venv/.demo
 	.venv/bin/python benchmarks/study_mirror.py docs/mirror.md --pictures docs/images
+
+# whether bands, promises, deviations and weights hold: at most three hours of processor time; goes
+# on where it was stopped; QUICK=1 for some minutes, which goes to build/
+coverage: .venv/.demo
+	.venv/bin/python benchmarks/study_coverage.py $(if $(QUICK),build/coverage.md --identified 6 \
+	    --diagnosed 1 --draws 10 --picture build/images/coverage.png,docs/coverage.md)
 
 # how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
 # cores; goes on where it was stopped

@@ -35,7 +35,8 @@ from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.tables.write import blocks_of
 from piezo_ident.report import save_plot, to_json
-from piezo_ident.verbs.predict import free_run, predict, prediction_doubts
+from piezo_ident.uncertainty.prediction import unknown_parts
+from piezo_ident.verbs.predict import bands, free_run, predict, prediction_doubts
 
 if TYPE_CHECKING:
     from piezo_ident.control.inverse import Inverse
@@ -74,7 +75,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     columns: dict[str, Sequence[Array]] = {}
     if record.is_measured:
         with naming(str(args.model)):
-            run = free_run(model, record)
+            run = free_run(model, record, args.interval)
         console.say(str(run))
         data |= to_json(run)
         runs = {**run} if isinstance(run, EachAxis) else {'y': run}
@@ -86,6 +87,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         pieces = {axis: x.pieces for axis, x in runs.items()}
         for axis, x in runs.items():
             columns[axis] = [piece.measured for piece in x.record]
+        halves = {axis: x.half_widths for axis, x in runs.items()}
         if args.plot is not None:
             with deferred_interrupts():
                 save_plot(run, args.plot)
@@ -96,12 +98,16 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
             )
         with naming(str(args.model)):
             made = predict(model, record)
-        pieces = {**made} if isinstance(made, EachAxis) else {'y': made}
-        warnings = prediction_doubts(model, record)
+            pieces = {**made} if isinstance(made, EachAxis) else {'y': made}
+            halves = bands(model, record, pieces, args.interval) if args.interval else {}
+        unknown = [text for half in halves.values() for text in unknown_parts(half)]
+        warnings = (*prediction_doubts(model, record), *unknown)
         console.say(f'{args.model} on {record.name}, which has no displacement: no error is known')
         for warning in warnings:
             console.say(f'  warning: {warning}')
         data['warnings'] = list(warnings)
+    if args.interval:
+        data['interval'] = print_bands(args.interval, halves, model, console)
     if args.out is not None:
         with deferred_interrupts():
             for axis, parts in pieces.items():
@@ -109,6 +115,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
                     v = voltage_of(axis)
                     columns[v] = [piece.channels[v] for piece in record]
                 columns[f'y_hat{axis[1:]}'] = parts
+                if args.interval:
+                    columns[f'half_width{axis[1:]}'] = halves[axis]
             _write_prediction(record, columns, args.out)
     print_faults(record, (), console)
     console.result({**data, **data_of(record), **_wrote(args, console)})
@@ -122,6 +130,28 @@ def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], pa
             yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
 
     write_columns(path, known)
+
+
+def print_bands(
+    level: float, halves: Mapping[str, Sequence[Array]], model: Any, console: Console
+) -> dict[str, Any]:
+    """Print the mean and the largest half width of each axis; return them for JSON."""
+    axes = {}
+    for axis, parts in halves.items():
+        span = abs(getattr(model, 'axes', {'y': model})[axis].scaling.Y)
+        half = 100.0 * np.concatenate(parts) / span
+        known = half[np.isfinite(half)]
+        mean, most = (float(f(known)) if known.size else math.nan for f in (np.mean, np.max))
+        console.say(
+            f'  band at {100.0 * level:g} %{f", axis {axis}" * (len(halves) > 1)}: half width '
+            f'{mean:.3g} % of the span of the model in the mean, {most:.3g} % at most'
+        )
+        axes[axis] = {
+            'mean_half_width_percent_of_span': mean,
+            'largest_half_width_percent_of_span': most,
+            'share_unknown': 1.0 - known.size / half.size,
+        }
+    return {'level': level, 'axes': axes}
 
 
 def invert_command(args: SimpleNamespace, console: Console) -> None:

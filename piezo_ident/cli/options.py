@@ -171,6 +171,12 @@ OUTPUT = [
 PREDICT = [
     _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
     _option('--plot', _file, 'PICTURE', 'Picture of measured and predicted.'),
+    _option(
+        '--interval',
+        click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+        'P',
+        'Band that holds this share of the errors, for example 0.9; column half_width of OUT.',
+    ),
     OVERWRITE,
 ]
 

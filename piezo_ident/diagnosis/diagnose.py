@@ -46,6 +46,7 @@ from piezo_ident.diagnosis.state import CREEP, State, TESTED
 from piezo_ident.diagnosis.verdict import (
     candidates_of,
     errors_of_laws,
+    errors_of_sets,
     judge,
     smallest_detectable,
     untestable_of,
@@ -237,17 +238,18 @@ def _diagnosed(
     # noise of single samples that the averaging to rows removes
     lost = 0.0 if single is None else max(single - noise, 0.0)
     without = wide if shown else candidates.without().fitted
-    before, refit, after = (
+    before, refit, held_out, after = (
         rows.errors(e, lost)
         for e in (
             rows.x - simulator.run(given),
             without.held_out_residual(rows),
+            last.fitted.held_out_residual(rows),
             last.fitted.held_out_residual(rows, rows.group),
         )
     )
     refined = refine(simulator, given, last, findings, (before, after))
     if refined.is_given:
-        after = before
+        held_out = after = before
     smallest = smallest_detectable(candidates, findings)
     # a search without a line, or without a coherent channel, leaves nothing to fit
     tested = {HUM} if lines.searched else set()
@@ -286,6 +288,8 @@ def _diagnosed(
         kinds=rows.kinds,
         gain=findings.gain,
         set_in=decision.set_in,
+        held_out=held_out,
+        errors_of_sets=errors_of_sets(candidates),
     )
 
 

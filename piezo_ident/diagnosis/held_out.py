@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
-from piezo_ident.identification.prepare import Run
+from piezo_ident.record.record import Piece
 from piezo_ident.selection.motion_kinds import description, interleaved, KINDS, kinds_of
 
 #: largest number of kinds of motion that are held out in turn
@@ -24,19 +24,19 @@ def are_parts(labels: Sequence[str]) -> bool:
     return all(x in (REST, ALIKE) or PART in x for x in labels)
 
 
-def stretches(run: Run, m: int) -> list[tuple[str, int, int]]:
-    """Return label, first row and end of the segments of a run; each row belongs to a segment."""
-    n = run.piece.n // m
-    if not run.piece.segments:
+def stretches(record: str, piece: Piece, m: int = 1) -> list[tuple[str, int, int]]:
+    """Return label, first row and end of the segments of a piece; each row is in a segment."""
+    n = piece.n // m
+    if not piece.segments:
         # without labels, parts of the time stand for kinds
         edges = np.linspace(0, n, GROUPS + 1).astype(int)
-        names = [f'{run.record}{PART}{i + 1}' for i in range(GROUPS)]
+        names = [f'{record}{PART}{i + 1}' for i in range(GROUPS)]
         return [
             (name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True) if b > a
         ]
     found: list[tuple[str, int, int]] = []
     end = 0
-    for s in run.piece.segments:
+    for s in piece.segments:
         start, stop = max(end, s.start // m), min(n, s.stop // m)
         if start > end:
             found.append(('ramp', end, start))

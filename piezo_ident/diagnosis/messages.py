@@ -127,6 +127,8 @@ def sentence(result: Diagnosis) -> str:
         texts.append(f'{hidden} may hide in that hysteresis, and these data do not tell')
     elif result.group and result.verdict == 'partly_explained':
         texts.append(f'whether it is {_or(result.group.names)}, these data do not tell')
+    if result.promise:
+        texts.append(f'another record will show {result.promise.told}')
     if result.outside:
         low, high = result.given.scaling.range
         texts.append(

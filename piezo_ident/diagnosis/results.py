@@ -15,6 +15,7 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Fault, Piece
+from piezo_ident.selection.judged import Promise
 
 FORMULA = (
     '100 rms(y - y_hat) / (max y - min y), free run, the zero of each record free; before: the '
@@ -252,6 +253,13 @@ class Diagnosis(Showable):
         error of the model as given; otherwise to the error of the best H.
     outside : float
         Share of the samples whose voltage lies outside the range of the given model.
+    held_out : Errors or None
+        Errors of the refined model on blocks that were held out in turn, as `after`.
+    errors_of_sets : mapping of tuple of str to float
+        Error beyond the noise that the best candidate of each set of effects leaves, % of stroke.
+    promise : Promise or None
+    weights : mapping of str to float
+        Weight of each set of effects, joined by ``+``, and of ``none of these``; the sum is one.
 
     Examples
     --------
@@ -293,6 +301,10 @@ class Diagnosis(Showable):
     gain: OtherGain | None = None
     set_in: bool = False
     outside: float = 0.0
+    held_out: Errors | None = None
+    errors_of_sets: Mapping[tuple[str, ...], float] = field(default_factory=dict)
+    promise: Promise | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def changes(self) -> tuple[str, ...]:

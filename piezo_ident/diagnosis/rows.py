@@ -284,7 +284,7 @@ def make_rows(
     first = 0
     for run, good in zip(runs, keep, strict=True):
         number = np.full(good.size, -1)
-        for label, start, stop in stretches(run, m):
+        for label, start, stop in stretches(run.record, run.piece, m):
             count = max(1, round((stop - start) / longest))
             for part in np.array_split(np.arange(start, stop), count):
                 if good[part].any():

@@ -270,6 +270,12 @@ def untestable_of(
     )
 
 
+def errors_of_sets(candidates: Candidates) -> Mapping[tuple[str, ...], float]:
+    """Compute the error beyond the noise that each set of effects leaves, % of stroke."""
+    bests = ((s, candidates.best(s)) for s in candidates.sets)
+    return {s: candidates.rows.percent(candidates.left(c)) for s, c in bests if c is not None}
+
+
 def errors_of_laws(candidates: Candidates) -> Mapping[str, float]:
     """Compute the error of each law of H on held-out kinds of excitation, % of stroke."""
     rows = candidates.rows

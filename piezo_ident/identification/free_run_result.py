@@ -106,6 +106,7 @@ def outcome_of(
         memories=memories,
         offsets=offsets,
         judged=(tested, at_test),
+        fit=last,
     )
 
 

@@ -77,6 +77,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record, records_of
+from piezo_ident.selection.judged import Judged, JudgedRun
 from scipy import __version__ as scipy_version
 
 #: a model without a pair of poles and zeros that H may replace may err more by this share
@@ -154,11 +155,20 @@ def _identify(
         settings=settings,
         records=(*data.records, *validation),
         memories=fit.memories,
+        judged=_judged(predictions, fit),
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
     provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, runs))
     return replace(result, model=replace(model, identification=provenance))
+
+
+def _judged(predictions: Sequence[Prediction], fit: FitOutcome) -> Judged:
+    runs = (
+        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)
+        for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
+    )
+    return Judged(tuple(runs), fit.fit)
 
 
 def _labelled(

@@ -12,6 +12,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.showable import Showable
+from piezo_ident.fitting.free_run import Fit
 from piezo_ident.identification.spectra import FrequencyResponse
 from piezo_ident.identification.step1_delay import StepDelay
 from piezo_ident.identification.step2_dynamics import OrderTable
@@ -22,6 +23,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
+from piezo_ident.selection.judged import Judged, Promise
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = Mapping[tuple[str, float], StartLike]
@@ -66,12 +68,6 @@ class Settings:
     ------
     ConfigError
         If a value is out of range.
-
-    Examples
-    --------
-    Settings of the paper:
-
-    >>> paper = Settings(thresholds=10, solver='swarm')
     """
 
     thresholds: int | None = None
@@ -118,7 +114,7 @@ class DelayResult:
     ----------
     samples : int
     std : float
-        Standard deviation [samples]; infinite if it is unknown or was not estimated.
+        Standard deviation [samples]; infinite if it is unknown.
     source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
@@ -283,7 +279,9 @@ class FitOutcome:
         Distance of the zero of displacement of a run from the zero of the model [m]; keys as in
         `memories`.
     judged : (StageModel, Memories) or None
-        Model and memories whose errors are reported, if the final model was fitted to all data.
+        Judged model and memories, if the final model was fitted to all data.
+    fit : Fit or None
+        The fit of all parameters together.
     """
 
     model: StageModel
@@ -296,6 +294,7 @@ class FitOutcome:
     memories: Memories = field(default_factory=dict)
     offsets: Mapping[tuple[str, float], float] = field(default_factory=dict)
     judged: tuple[StageModel, Memories] | None = None
+    fit: Fit | None = None
 
 
 def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
@@ -336,6 +335,9 @@ class Identification(Showable):
     memories : mapping of (str, float) to ndarray or Start
         Fitted play outputs at the start of a piece, and creep that goes on from there; keys are
         record name and start time.
+    promise : Promise or None
+    judged : Judged or None
+        What promise, band and deviations follow from; None once they are there.
 
     Examples
     --------
@@ -361,6 +363,8 @@ class Identification(Showable):
     settings: Settings
     records: tuple[Record, ...] = ()
     memories: Memories = field(default_factory=dict)
+    promise: Promise | None = None
+    judged: Judged | None = None
 
     @property
     def parameters(self) -> tuple[ModelParameter, ...]:
@@ -371,7 +375,7 @@ class Identification(Showable):
         """
         Compute the rms error over one kind of data, weighted by samples; NaN without such data.
 
-        Ramps and rests do not count: they are easy, and would lower the error.
+        Ramps and rests do not count: they are easy.
         """
         return rms_percent(self._driven(data))
 

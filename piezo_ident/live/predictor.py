@@ -25,11 +25,14 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples, time_problem
 from piezo_ident.record.record import Piece
+from piezo_ident.uncertainty.band import band_of, BandStream, KEY
 
 #: longest gap that a straight line bridges; a longer gap starts a new run [s]
 BRIDGE = 0.5
 #: share of the voltage range that counts as its lower end; a stage there has a known memory
 REST = 0.01
+#: share of the errors that a band holds unless another one is asked for (taste)
+LEVEL = 0.9
 
 
 class Predictor:
@@ -40,17 +43,28 @@ class Predictor:
     ----------
     problem : str
         The last problem of the stream; empty without one.
+    half_width : Samples or None
+        Half width of the band of the last block [m]; None if the model carries no band.
+
+    Parameters
+    ----------
+    level : float, optional
+        Share of the errors that the band holds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, level: float = LEVEL) -> None:
         self.model: StageModel | None = None
         self.problem = ''
+        self.half_width: Samples | None = None
+        self._level = level
+        self._band: BandStream | None = None
         self._clock = BlockClock()
         self._clear()
 
     def _clear(self) -> None:
         self._past = History()
         self._stream: Stream | None = None
+        self._band = None
         self._lowest = float('inf')
 
     @property
@@ -100,8 +114,12 @@ class Predictor:
                 )
         if np.isfinite(self._clock.period):
             self._check_rate(model)
+        if KEY in model.identification:
+            # a damaged band is refused now, not in the stream
+            band_of(model)
         self.model = model
         self._stream = self.caught_up(model) if self._past else None
+        self._band = None
         if self._past and self.problem.startswith('the stream'):
             self.problem = ''
 
@@ -164,7 +182,21 @@ class Predictor:
         y = self._advance(t, v)
         if y is None:
             return None
+        half = self._half_width(v, y)
+        self.half_width = (
+            None if half is None else Samples(t, half, samples.segment, 'displacement')
+        )
         return Samples(t, y, samples.segment, 'displacement')
+
+    def _half_width(
+        self, v: NDArray[np.float64], y: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        model = self.model
+        if model is None or KEY not in model.identification:
+            return None
+        if self._band is None:
+            self._band = BandStream(model, self._level, plays=self.memory_known, creep=False)
+        return self._band.follow(v, y)
 
     def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
         if problem := time_problem(t):

@@ -22,9 +22,7 @@ from piezo_ident import __version__
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.common.files import unwritable, write_text
 from piezo_ident.common.process import Tick
-from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
-from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Identification, Settings
 from piezo_ident.many.table import diagnosed, identified, natural, Row, Value
 from piezo_ident.many.workers import dask, processes
@@ -32,6 +30,7 @@ from piezo_ident.model.files import load
 from piezo_ident.record import io as record_io
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Record
+from piezo_ident.verbs.learn import diagnose_axis, identify_axis
 
 MARK = 'many.json'
 
@@ -46,7 +45,7 @@ class Identify:
 
     def __call__(self, record: Record, name: str) -> tuple[Identification, dict[str, Value]]:
         """Identify a record; the result and the cells of its row."""
-        result = identify(record, self.settings)
+        result = identify_axis(record, self.settings)
         return result, identified(result, record)
 
 
@@ -74,7 +73,7 @@ class Diagnose:
     def __call__(self, record: Record, name: str) -> tuple[Diagnosis, dict[str, Value]]:
         """Diagnose a record; the result and the cells of its row."""
         given = self.model_of(name)
-        result = diagnose(load(given), record, self.settings)
+        result = diagnose_axis(load(given), record, self.settings)
         return result, {'model': given.name, **diagnosed(result, record)}
 
 

@@ -85,6 +85,10 @@ class FreeRun(Showable):
         Errors over the samples from `late` on; None without such samples.
     warnings : tuple of str
         Limits of the trust in the prediction.
+    interval : float or None
+        Level of the band; None without a band.
+    half_widths : tuple of ndarray
+        Half width of the band of each piece [m], infinite where nothing is known.
 
     Examples
     --------
@@ -102,6 +106,18 @@ class FreeRun(Showable):
     errors: FreeRunErrors
     errors_after_start: FreeRunErrors | None
     warnings: tuple[str, ...] = ()
+    interval: float | None = None
+    half_widths: tuple[Array, ...] = ()
+
+    @property
+    def inside(self) -> float:
+        """Share of the judged samples with a known band that lie inside it; NaN without any."""
+        inside = known = 0
+        for piece, y_hat, half in zip(self.record, self.pieces, self.half_widths, strict=False):
+            judged = piece.mask & np.isfinite(half)
+            known += int(judged.sum())
+            inside += int((np.abs(piece.y - y_hat)[judged] <= half[judged]).sum())
+        return inside / known if known else float('nan')
 
     @property
     def predicted(self) -> Array:

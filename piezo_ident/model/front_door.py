@@ -42,7 +42,8 @@ class ModelParameter:
         normalised chain, in which 1 is the full span.
     value : float or str
     std : float or None
-        Standard deviation of its fit with the other steps taken as known; None if unknown.
+        Standard deviation of its fit, with the dependence on all other parameters if the model
+        holds it (`piezo_ident.uncertainty.parameters`); None if unknown.
     """
 
     part: str
@@ -50,6 +51,13 @@ class ModelParameter:
     value: float | str
     unit: str
     std: float | None = None
+
+    @property
+    def is_known(self) -> bool | None:
+        """Whether the data tell the value: its deviation is smaller; None without a deviation."""
+        if self.std is None or isinstance(self.value, str):
+            return None
+        return self.std < abs(self.value)
 
 
 class Bode(NamedTuple):
@@ -63,9 +71,9 @@ class Bode(NamedTuple):
 class FrontDoor:
     """Base of a model; its methods call rooms below the room of models."""
 
-    def predict(self: Any, record: Record) -> FreeRun:
+    def predict(self: Any, record: Record, interval: float | None = None) -> FreeRun:
         """
-        Predict a measured record in free run; see `piezo_ident.free_run`.
+        Predict a measured record in free run, with a band on request; `piezo_ident.free_run`.
 
         Examples
         --------
@@ -76,7 +84,7 @@ class FrontDoor:
         """
         from piezo_ident import free_run
 
-        run: FreeRun = free_run(self, record)
+        run: FreeRun = free_run(self, record, interval)
         return run
 
     def score(self: Any, record: Record) -> FreeRunErrors:
@@ -117,9 +125,19 @@ class FrontDoor:
         return invert(self, wanted, **options)
 
     @property
+    def quantities(self: Any) -> tuple[ModelParameter, ...]:
+        """List gain and phase of G, modes, static gain and loop widths, with their deviations."""
+        told = self.identification.get('quantities', ())
+        keys = {'part', 'name', 'value', 'unit', 'std'}
+        rows = told if isinstance(told, Sequence) and not isinstance(told, str) else ()
+        return tuple(
+            ModelParameter(**row) for row in rows if isinstance(row, dict) and set(row) == keys
+        )
+
+    @property
     def parameters(self: Any) -> tuple[ModelParameter, ...]:
         """
-        List all parameters with their standard deviations.
+        List all parameters with their standard deviations, then `quantities`.
 
         Examples
         --------
@@ -153,7 +171,7 @@ class FrontDoor:
                     own = f'{name}_{i}' if many else name
                     one = x if isinstance(x, str) else float(x)
                     rows.append(ModelParameter(setting.name, own, one, units[name]))
-        return tuple(rows)
+        return (*rows, *self.quantities)
 
     def bode(self: Any, frequency: ArrayLike | None = None) -> Bode:
         """

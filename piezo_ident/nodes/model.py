@@ -43,7 +43,7 @@ class ModelNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         warm_up()
-        self._predictor, self._matcher = Predictor(), Matcher()
+        self._predictor, self._matcher = Predictor(self.values['interval']), Matcher()
         self._preview = Preview(self.values['preview_rate'])
         self._error = LiveError(self.values['window'])
         values = [self.values[n] for n in ('horizon', 'observe_gain', 'preview_rate', 'adapt')]
@@ -65,6 +65,7 @@ class ModelNode(LabNode):
         self.offer('restore', self._corrector.restore)
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         self._prediction = self.create_publisher(Float64MultiArray, 'prediction', STREAM)
+        self._band = self.create_publisher(Float64MultiArray, 'prediction_band', STREAM)
         self._residual = self.create_publisher(Float64MultiArray, 'residual', STREAM)
         self._estimate = self.create_publisher(Float64MultiArray, 'estimate', STREAM)
         self._corrections = self.create_publisher(JointState, 'corrections', PREVIEW)
@@ -146,6 +147,8 @@ class ModelNode(LabNode):
             self._error.clear()
         if prediction is not None:
             self._prediction.publish(to_message(prediction))
+            if predictor.half_width is not None:
+                self._band.publish(to_message(predictor.half_width))
         self._count += samples.t.size
         numbers, (low, high) = samples.values[np.isfinite(samples.values)], self._range
         self._range = float(numbers.min(initial=low)), float(numbers.max(initial=high))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from piezo_ident.live.predictor import LEVEL
 from piezo_ident.model.observer import HORIZON
 
 #: topics of blocks of samples, and topics of texts that a late node must still receive
@@ -216,6 +217,15 @@ MODEL = (
         choices=('off', 'gain', 'hysteresis'),
     ),
     Declaration('output', '', 'file into which ~/save writes what was learnt; empty: none'),
+    Declaration(
+        'interval',
+        LEVEL,
+        'share of the errors that the band holds',
+        '1',
+        0.01,
+        0.999,
+        read_only=True,
+    ),
 )
 
 RECORDER = (

@@ -34,6 +34,7 @@ from piezo_ident.report.table import (
     Table,
     table,
 )
+from piezo_ident.uncertainty.weights import NONE, NOTHING
 
 #: columns of every table of errors
 STATES = ('as given', 'H refitted', 'refined')
@@ -41,6 +42,8 @@ STATES = ('as given', 'H refitted', 'refined')
 UNKNOWN = 'floor unknown: '
 #: candidates in a summary, at most
 CANDIDATES = 6
+#: sign and length of the bar of a weight of one, and smallest weight that is shown
+BAR, BARS, LEAST_WEIGHT = '█', 40, 0.005
 FOOTER = (
     'Every error is of a free run, never of one-step prediction. Base model: Gu, Li, Zhu and Su, '
     'IEEE/ASME Trans. Mechatronics 21(3), 2016, doi:10.1109/TMECH.2015.2465868. Beside this page: '
@@ -163,6 +166,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         ('verdict', result.verdict.replace('_', ' ')),
         ('model', ', '.join(result.changes) or 'stays as given'),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
+        *(('another record', p.told) for p in [result.promise] if p),
         ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]
@@ -225,6 +229,16 @@ def _candidate_tables(result: Diagnosis, most: int | None = None) -> list[Table]
     return table(title, ('effect', 'share', 'why not'), rows, note)
 
 
+def _weight_tables(result: Diagnosis) -> list[Table]:
+    rows = [
+        (name.replace('+', ' and '), share_text(w), BAR * round(BARS * w))
+        for name, w in result.weights.items()
+        if w >= LEAST_WEIGHT or name == NOTHING
+    ]
+    note = f'From kinds of motion held out; the prior of {NOTHING} is {share_text(NONE)}.'
+    return table('Weight of each cause', ('cause', 'weight', ''), rows, note)
+
+
 def _untestable_tables(result: Diagnosis) -> list[Table]:
     rows = [(x.name, x.needs) for x in result.untestable]
     return table('What these data cannot test', ('effect', 'needs'), rows)
@@ -268,6 +282,7 @@ def diagnosis_page(
         *_untestable_tables(result),
         *_fault_tables(result),
     ]
+    tried = _weight_tables(result) + _candidate_tables(result, candidates)
     return Page(
         title='Diagnosis of a piezo stage',
         source=', '.join(result.records),
@@ -281,7 +296,7 @@ def diagnosis_page(
             Section('Error before and after', errors, brief=True),
             Section('The residual before and after', shown),
             Section('Effects that were found', found, brief=True),
-            Section('Candidates', _candidate_tables(result, candidates), brief=True),
+            Section('Candidates', tried, brief=True),
             Section('Remaining error', remain, brief=True),
             Section('Origin', origin),
         ),

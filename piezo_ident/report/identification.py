@@ -78,6 +78,7 @@ def facts(result: Identification) -> list[tuple[str, str]]:
         'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
         'hysteresis': _law(result),
         'error holds': _stands_for(result),
+        'another record': result.promise.told if result.promise else '',
         'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
         'effects': ', '.join(effect.name for effect in model.effects),
     }

@@ -22,6 +22,7 @@ from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
+from piezo_ident.selection.judged import Promise
 
 if TYPE_CHECKING:
     from piezo_ident.control.inverse import Inverse
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     Shown = One | EachAxis[Identification] | EachAxis[Diagnosis] | EachAxis[FreeRun]
 
 VERSION = {'schema_version': 1, 'package_version': __version__}
+#: a diagnosis has weights and promises since 2
+DIAGNOSIS_VERSION = 2
 
 
 def to_json(
@@ -101,6 +104,7 @@ def _free_run(run: FreeRun) -> dict[str, Any]:
         'whole': _free_run_errors(run.errors),
         'start_forgotten': None if late is None else _free_run_errors(late),
         'memory_estimated': list(run.estimated),
+        'share_inside_band': None if run.interval is None else run.inside,
         'warnings': list(run.warnings),
     }
 
@@ -183,6 +187,8 @@ def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, A
             **{kind.replace(' ', '_'): result.error(kind) for kind in metrics.KINDS},
             'rows': [asdict(row) for row in result.errors],
         },
+        'promise': _promise(result.promise),
+        'quantities': [asdict(p) | {'known': p.is_known} for p in model.quantities],
         'sines': [asdict(row) for row in sines_of(runs)],
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
         'delay': _delay(result.delay, model.delay.total / model.sample_rate),
@@ -261,6 +267,7 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
 
     group, left = result.group, result.unexplained
     return {
+        'schema_version': DIAGNOSIS_VERSION,
         'verdict': result.verdict,
         'sentence': result.sentence,
         'effects': [
@@ -292,6 +299,8 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
             'refit': _errors(result.refit),
             'after': _errors(result.after),
         },
+        'promise': _promise(result.promise),
+        'weights': dict(result.weights),
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},
         'smallest_detectable': {'percent_of_stroke': result.smallest_detectable},
         'hysteresis': {'law': result.law, 'errors_of_laws': dict(result.errors_of_laws)},
@@ -306,6 +315,12 @@ def _diagnosis(result: Diagnosis) -> dict[str, Any]:
         'settings': asdict(result.settings),
         'seed': result.settings.seed,
     }
+
+
+def _promise(promise: Promise | None) -> dict[str, Any] | None:
+    if promise is None:
+        return None
+    return {'unit': '% of stroke', 'same_motion': promise.same, 'other_motion': promise.other}
 
 
 def _share(value: float) -> float:

@@ -63,7 +63,10 @@ def plot(result: Result) -> Figure:
     if isinstance(result, Record):
         return record_figure(result)
     if isinstance(result, FreeRun):
-        return overview_figure(_longest(result))
+        i = int(np.argmax([piece.n for piece in result.record]))
+        longest, y = result.record.pieces[i], result.pieces[i]
+        half = result.half_widths[i] if result.half_widths else None
+        return overview_figure(PieceRun(result.record.name, longest, y, y), half_width=half)
     if isinstance(result, Inverse):
         from piezo_ident.report.figures.drive import drive_figure
 
@@ -75,12 +78,6 @@ def plot(result: Result) -> Figure:
     if isinstance(result, Diagnosis):
         return residual_figure(worst_pieces(result, 1)[0])
     return loops_figure(piece_runs(result.model, result.records, result.memories))
-
-
-def _longest(result: FreeRun) -> PieceRun:
-    record = result.record
-    i = int(np.argmax([piece.n for piece in record]))
-    return PieceRun(record.name, record.pieces[i], result.pieces[i], result.pieces[i])
 
 
 def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> None:
@@ -134,6 +131,12 @@ def _value(p: ModelParameter) -> str:
     return f'{p.name} {value}' + f' {p.unit}' * (p.unit not in ('', '1', 'name'))
 
 
+def _with_deviation(p: ModelParameter) -> str:
+    if p.is_known is False:
+        return f'not known by these data (± {number(p.std, 2)} {p.unit})'
+    return f'{number(float(p.value), 4)} ± {number(p.std, 2)} {p.unit}'.rstrip()
+
+
 def model_text(model: StageModel) -> str:
     """Describe a model as text: range, hysteresis, dynamics, delay, effects and known errors."""
     s, h, rate = model.scaling, model.hysteresis, model.sample_rate
@@ -154,6 +157,7 @@ def model_text(model: StageModel) -> str:
     for effect in model.effects:
         own = [p for p in model.parameters if p.part == effect.name]
         rows.append((effect.name, ', '.join(map(_value, own))))
+    rows += [(f'{p.part}, {p.name}', _with_deviation(p)) for p in model.quantities]
     error, worst = expected_error(model), worst_error(model)
     known = 'unknown' if error is None else f'{number(error)}, at worst {number(worst)}'
     rows += [('error', known + ' % of stroke' * (error is not None))]
@@ -203,6 +207,12 @@ def _free_run(result: FreeRun) -> tuple[str, Table]:
             zero = ': the sensor was set to zero elsewhere' if e.only_offset else ''
             left = f'{number(e.percent_without_offset)} % after removing a mean of'
             rows.append(('', f'{left} {length(e.offset)}{zero}'))
+    if result.interval is not None:
+        half = np.concatenate(result.half_widths)
+        half = half[np.isfinite(half)]
+        mean = length(float(half.mean())) if half.size else 'not known'
+        level, inside = (f'{100.0 * x:.3g} %' for x in (result.interval, result.inside))
+        rows.append(('band', f'± {mean} in the mean at {level}; {inside} lie inside'))
     if late is None:
         rows.append(('start', 'no sample at which it is forgotten: drive a wider range'))
     rows += [('warning', warning) for warning in result.warnings]

@@ -25,6 +25,9 @@ SETTLING, SETTLING_TIME = 0.2, 0.02
 WHITE, FEWEST = 0.95, 2000
 #: longest block of a table of block lengths [samples]
 LONGEST_BLOCK = 4096
+#: a line of the spectrum over its surroundings: white noise exceeds this once in e^10 bins; and
+#: the bins an octave at which the surroundings are measured, over two octaves (taste)
+LINE, AN_OCTAVE = 10.0, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +103,11 @@ def residual_noise_floor(
 
     The difference of two consecutive periods of a repeating v, from the second period on, has
     twice the variance of the noise.  The error of the model repeats and drops out; slow drift is
-    subtracted.  Records without repeats use rests, less parabolas in time and in the logarithm of
-    time, which describe creep.  The weighted median over the stretches counts, so that a settling
-    stretch does no harm.  A residual without repeats and rests is noise if it is white throughout:
-    the error of a model has a memory.  Noise slower than a period or a rest counts as drift.
+    subtracted, and lines of the spectrum are lowered.  Records without repeats use rests, less
+    parabolas in time and in the logarithm of time, which describe creep.  The weighted median over
+    the stretches counts, so that a settling stretch does no harm.  A residual without repeats and
+    rests is noise if it is white throughout: the error of a model has a memory.  Noise slower than
+    a period or a rest counts as drift.
 
     Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012),
     section 2.5, doi:10.1002/9781118287422.
@@ -171,6 +175,7 @@ def _reading(
 ) -> _Reading | None:
     if series.size < 16:
         return None
+    series = _without_ringing(series)
     top = int(np.log2(max(1, min(longest, LONGEST_BLOCK))))
     rows = series.reshape(-1, frame)
     variances = []
@@ -181,6 +186,18 @@ def _reading(
         power = np.sum(means**2, axis=1) / max(count - removed, 1)
         variances.append(float(np.median(power) if power.size > 2 else power.mean()))
     return _Reading(series, part.piece.sample_rate, np.array(variances))
+
+
+def _without_ringing(x: Array) -> Array:
+    """Lower the lines of a spectrum to its surroundings: a mode that rings on is no noise."""
+    X = np.fft.rfft(x)
+    power, n = np.abs(X[1:]) ** 2, X.size - 1
+    at = np.unique(np.geomspace(1, n, AN_OCTAVE * int(np.log2(n)) + 2).astype(int))
+    # the median of an exponential distribution is ln 2 of its mean
+    level = [np.median(power[max(0, k // 2 - 4) : 2 * k + 4]) / np.log(2.0) for k in at]
+    limit = np.interp(np.log(np.arange(1, n + 1)), np.log(at), level)
+    X[1:] *= np.sqrt(np.where(power > LINE * limit, limit / np.maximum(power, 1e-300), 1.0))
+    return np.asarray(np.fft.irfft(X, x.size))
 
 
 def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
-from piezo_ident.diagnosis import diagnose as diagnose_axis
+from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
-from piezo_ident.identification.identify import identify as identify_axis
+from piezo_ident.identification.identify import identify as identification_alone
 from piezo_ident.identification.results import (
     Identification,
     Progress,
@@ -31,6 +31,8 @@ from piezo_ident.model.multi_axis import (
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
+from piezo_ident.uncertainty.parameters import with_deviations
+from piezo_ident.uncertainty.promises import promised_diagnosis, promised_identification
 
 #: largest change of a voltage at rest, as a share of its range
 RESTS = 1e-3
@@ -38,6 +40,25 @@ RESTS = 1e-3
 LONG = 1.0
 #: length of the blocks in which rest is judged [s]
 BLOCK = 0.25
+
+
+def identify_axis(
+    records: Sequence[Record] | Record, settings: Settings | None = None, **options: Any
+) -> Identification:
+    """Identify a stage of one axis, with the band and the promise; see `identify`."""
+    result = identification_alone(records, settings, **options)
+    return replace(promised_identification(with_deviations(result)), judged=None)
+
+
+def diagnose_axis(
+    model: StageModel,
+    records: Sequence[Record] | Record,
+    settings: DiagnosisSettings | None = None,
+    *,
+    progress: Progress = silent,
+) -> Diagnosis:
+    """Diagnose a stage of one axis, with the band and the promise; see `diagnose`."""
+    return promised_diagnosis(diagnosis_alone(model, records, settings, progress=progress))
 
 
 def identify(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import overload
 
 from piezo_ident.common.arrays import Array
@@ -20,19 +21,22 @@ from piezo_ident.model.multi_axis import (
 )
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
+from piezo_ident.uncertainty.prediction import half_widths, with_interval
 
 
 @overload
-def free_run(model: StageModel, record: Record) -> FreeRun: ...
+def free_run(model: StageModel, record: Record, interval: float | None = ...) -> FreeRun: ...
 
 
 @overload
 def free_run(
-    model: StageModel | MultiAxisModel, record: Record
+    model: StageModel | MultiAxisModel, record: Record, interval: float | None = ...
 ) -> FreeRun | EachAxis[FreeRun]: ...
 
 
-def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | EachAxis[FreeRun]:
+def free_run(
+    model: StageModel | MultiAxisModel, record: Record, interval: float | None = None
+) -> FreeRun | EachAxis[FreeRun]:
     """
     Predict a record in free run, and compare it with the measured displacement.
 
@@ -45,6 +49,8 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     model : StageModel or MultiAxisModel
     record : Record
         Its displacement serves only for this estimate and for the errors.
+    interval : float, optional
+        Level of a band of the error, for example 0.9; see `piezo_ident.uncertainty.band`.
 
     Returns
     -------
@@ -53,7 +59,8 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     Raises
     ------
     ModelError
-        When a piece has another sampling rate than the model, or the prediction overflows.
+        When a piece has another sampling rate than the model, the prediction overflows, or the
+        model carries no band.
     DataError
         When the record lacks the displacement or an axis; `simulate` of a model takes voltages
         alone.
@@ -70,10 +77,11 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     True
     """
     if not isinstance(model, MultiAxisModel):
-        return run_axis(model, record)
+        run = run_axis(model, record)
+        return run if interval is None else with_interval(model, run, interval)
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     seen = model.seen(record)
-    return EachAxis({axis: run_axis(x, seen[axis]) for axis, x in model.axes.items()})
+    return EachAxis({axis: free_run(x, seen[axis], interval) for axis, x in model.axes.items()})
 
 
 def predict(
@@ -84,6 +92,18 @@ def predict(
         return predict_axis(model, record)
     seen = model.seen(record)
     return EachAxis({axis: predict_axis(x, seen[axis]) for axis, x in model.axes.items()})
+
+
+def bands(
+    model: StageModel | MultiAxisModel,
+    record: Record,
+    predicted: Mapping[str, Sequence[Array]],
+    interval: float,
+) -> dict[str, tuple[Array, ...]]:
+    """Compute the half widths [m] of predictions from voltages alone, by axis."""
+    axes = model.axes if isinstance(model, MultiAxisModel) else {'y': model}
+    seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
+    return {k: half_widths(x, seen[k], predicted[k], interval) for k, x in axes.items()}
 
 
 def prediction_doubts(model: StageModel | MultiAxisModel, record: Record) -> tuple[str, ...]:

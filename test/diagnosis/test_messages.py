@@ -188,6 +188,7 @@ def agree(result, data, page, refined, record):
         data['unexplained']['rms_percent_of_stroke'],
         data['smallest_detectable']['percent_of_stroke'],
         *(100.0 * data['share_outside_range'], *result.given.scaling.range),
+        *(data['promise'][key] for key in ('same_motion', 'other_motion')),
     ]
     for said in map(float, re.findall(r'\d+\.?\d*(?:e-?\d+)?', sentence)):
         assert any(x == pytest.approx(said, rel=0.05) for x in told), (said, sentence)

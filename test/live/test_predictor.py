@@ -14,6 +14,7 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
+from piezo_ident.uncertainty.band import BandStream, KEY, PredictionBand
 import pytest
 
 RATE = 10_000.0
@@ -101,6 +102,26 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
     np.testing.assert_array_equal(made, m.predict_piece(Piece(v, np.zeros_like(v), RATE)))
     assert predictor.problem == '' and predictor.lost == predictor.late == 0
     assert predictor.memory_known
+
+
+def test_the_band_of_a_stream_is_that_of_the_whole_voltage():
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    banded, v = model(identification={KEY: band.to_dict()}), drive(2000)
+    predictor = Predictor(0.8)
+    predictor.set_model(banded)
+    halves = []
+    for block in cut(v):
+        y = predictor.process(block)
+        assert y is not None and np.array_equal(predictor.half_width.t, y.t)
+        halves.append(predictor.half_width.values)
+    expected = BandStream(banded, 0.8, creep=False).follow(v, banded.simulate(v))
+    np.testing.assert_array_equal(np.concatenate(halves), expected)
+    damaged = model(identification={KEY: {**band.to_dict(), 'ratio': None}})
+    with pytest.raises(ModelError, match=KEY):
+        predictor.set_model(damaged)
+    predictor.set_model(model())
+    assert predictor.process(cut(v[:100], start=2000)[0]) is not None
+    assert predictor.half_width is None
 
 
 @pytest.mark.parametrize('n', [20_000, 120_000], ids=['whole run at hand', 'longer than kept'])

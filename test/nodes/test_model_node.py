@@ -12,6 +12,7 @@ import numpy as np
 from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.blocks import Samples
+from piezo_ident.uncertainty.band import BandStream, KEY, PredictionBand
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
@@ -124,6 +125,20 @@ def test_prediction_is_the_model_bit_for_bit_and_carries_t_and_segment(fast):
     np.testing.assert_array_equal(y, model_of(paper()).stream().process(v, t))
     last = fast.collect('prediction')[-1]
     assert (last.segment, last.quantity) == ('sine:5Hz', 'displacement')
+
+
+def test_a_model_with_a_band_publishes_its_half_width_beside_the_prediction(fast):
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    text = paper(identification={KEY: band.to_dict()})
+    halves = fast.collect('prediction_band')
+    fast.matched('prediction_band')
+    since, before = reset(fast, text), len(halves)
+    send(fast, blocks(2000))
+    t, y = heard(fast, 'prediction', since['prediction'], 20)
+    at, half = heard(fast, 'prediction_band', before, 20)
+    np.testing.assert_array_equal(at, t)
+    v = sine(2000)[1]
+    np.testing.assert_array_equal(half, BandStream(model_of(text), 0.9).follow(v, y))
 
 
 def test_a_new_model_takes_over_without_a_glitch(fast):

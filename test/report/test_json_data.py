@@ -80,7 +80,7 @@ def test_the_schema_tells_good_from_bad():
 def test_what_it_says():
     found = example('named')
     data = to_json(found)
-    assert data['schema_version'] == 1
+    assert data['schema_version'] == 2
     assert data['package_version'] == __version__
     assert data['verdict'] == 'named'
     (effect,) = data['effects']

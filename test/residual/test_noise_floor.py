@@ -89,6 +89,20 @@ def test_rests_serve_where_nothing_repeats():
     assert floor.at(16) == pytest.approx(0.5e-9, rel=0.35)
 
 
+@pytest.mark.parametrize('decay', [0.05, 0.5, np.inf])
+@pytest.mark.parametrize('kind', ['white', 'pink'])
+def test_a_stage_that_rings_at_its_rests_is_no_noise(decay, kind):
+    rng, rate, n = np.random.default_rng(8), 20_000.0, 12_000
+    noise = 2e-9 * (rng.standard_normal(n) if kind == 'white' else pink(n, rng))
+    t = np.arange(n) / rate
+    ringing = 2e-8 * np.cos(2 * np.pi * 731.3 * t) * np.exp(-t / decay)
+    piece = Piece(np.zeros(n), noise, rate)
+    part = ResidualPart('r', piece, noise + ringing)
+    floor = residual_noise_floor([part], stretches_of(part))
+    assert 'rests' in floor.source
+    assert 0.67 < floor.rms / np.std(noise) < 1.5
+
+
 def test_floor_is_unknown_without_either():
     rng = np.random.default_rng(5)
     v = np.cumsum(rng.standard_normal(5000))

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 from piezo_ident.common.process import Tick
-from piezo_ident.diagnosis import diagnose, Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.identify import first_steps, identify
+from piezo_ident.identification.identify import first_steps
 from piezo_ident.identification.results import Identification, Settings, Steps
 from piezo_ident.live.capture import refuse_incomplete, Snapshot
 from piezo_ident.model.files import model_to_yaml
@@ -29,6 +29,7 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report import headline, json_text, steps_to_json, write_report
+from piezo_ident.verbs.learn import diagnose_axis, identify_axis
 
 #: a program as short as all three steps allow
 _SMALL = """
@@ -162,7 +163,7 @@ def identify_capture(
             _sentence(step), report=json.dumps(data), warnings=len(record.faults), steps=step
         )
     known = (steps or Steps()) if which == 'hysteresis' else None
-    result = identify(records, settings, steps=known, progress=tick)
+    result = identify_axis(records, settings, steps=known, progress=tick)
     result = replace(result, warnings=(*result.warnings, *_reversed(result.model, before)))
     tick('report', 0.98)
     runs = piece_runs(result.model, records, result.memories)
@@ -271,7 +272,7 @@ def diagnose_capture(
     records = [r for r in records_of_runs(record) if _is_driven(given, r)]
     if not records:
         return DiagnosisOutcome(None, wanted=next_experiment(None, asked=asked))
-    result = diagnose(given, records, settings, progress=tick)
+    result = diagnose_axis(given, records, settings, progress=tick)
     # every run is a record of its own, so a restart of the clock is harmless
     faults = (fault for fault in record.faults if fault.name != 'restart')
     result = replace(result, faults=(*faults, *result.faults))
@@ -324,4 +325,4 @@ def warm_up() -> None:
     sequence = parse_program(_SMALL).build(stage.model.sample_rate)
     record = stage.play(sequence, np.random.default_rng(0))
     settings = Settings(thresholds=3, max_order=2, solver='swarm', swarm_size=4)
-    identify(record, replace(settings, swarm_iterations=100))
+    identify_axis(record, replace(settings, swarm_iterations=100))

@@ -118,8 +118,8 @@ def record_figure(record: Record) -> Figure:
     return fig
 
 
-def overview_figure(run: PieceRun, remark: str = '') -> Figure:
-    """Draw voltage, displacement and error of a piece, with a remark on its model."""
+def overview_figure(run: PieceRun, remark: str = '', half_width: Array | None = None) -> Figure:
+    """Draw voltage, displacement, error and band of a piece, with a remark on its model."""
     piece, t, y = run.piece, run.piece.t, run.piece.measured
     fig = style.figure(5.0)
     axes = fig.subplots(3, 1, sharex=True, gridspec_kw={'height_ratios': [1, 1.7, 1.4]})
@@ -127,6 +127,8 @@ def overview_figure(run: PieceRun, remark: str = '') -> Figure:
     style.line(axes[1], t, 1e6 * y, COLOURS['under'], 'measured', linewidth=3.0)
     style.line(axes[1], t, 1e6 * run.y_hat, COLOURS['model'], 'model')
     unit, scale = _draw_error(axes[2], t, y - run.y_hat, y - run.y_static, 0.8)
+    if half_width is not None:
+        _draw_band(axes[2], t, scale * half_width)
     tidy(axes[0], '', 'voltage / V')
     tidy(axes[1], '', 'displacement / µm')
     lost = np.count_nonzero(~piece.mask)
@@ -141,6 +143,16 @@ def overview_figure(run: PieceRun, remark: str = '') -> Figure:
         style.legend_above(axes[2])
     fig.align_ylabels(list(axes))
     return fig
+
+
+def _draw_band(axes: Axes, t: Array, half: Array) -> None:
+    """Draw a band around zero, with gaps where it is not known, and make room for most of it."""
+    known = half[np.isfinite(half)]
+    half = np.where(np.isfinite(half), half, np.nan)
+    for sign, name in ((1.0, 'band'), (-1.0, '')):
+        style.line(axes, t, sign * half, COLOURS['static'], name, linewidth=0.8)
+    if known.size:
+        style.symmetric(axes, max(axes.get_ylim()[1], 1.1 * float(np.quantile(known, 0.95))))
 
 
 def _name_segments(axes: Axes, run: PieceRun) -> None:

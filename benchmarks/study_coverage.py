@@ -1,0 +1,388 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Whether bands, promises, deviations and weights hold, on stages of families that the model lacks.
+
+    python benchmarks/study_coverage.py docs/coverage.md --picture docs/images/coverage.png
+
+Every stage is one of `truths.draw` with a seed from `SEED` on, which nobody used while this was
+built.  `identified` stages have nothing hidden: a model from one record predicts the same motion
+again, and other motion.  `diagnosed` stages hide what their case says.  Finished stages are kept
+in ``build/coverage.jsonl``, so a study that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+import os
+from pathlib import Path
+
+# two threads of BLAS fight over narrow matrices; one process a core is faster
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.record.record import Piece
+from piezo_ident.report.figures import style
+from piezo_ident.uncertainty.parameters import quantities_of
+from piezo_ident.uncertainty.weights import NOTHING
+from side_by_side import machine
+from study_records import case_records
+from study_rows import all_rows, part_of, section
+from truths import Case, draw, FamilyStage
+
+#: first seed of the draw, and the group of families whose laws may be looked at
+SEED, GROUP = 9001, 'known'
+#: levels of the bands, and the one of the tables
+LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95)
+MAIN = LEVELS.index(0.9)
+#: measured records and the share that is identified; the rest is predicted
+MEASURED = (('piezo_levels.csv', 0.6), ('piezo_1hz.csv', 0.86))
+DATA = Path(os.environ.get('PIEZO_IDENT_DATA', Path(__file__).parents[2] / '../shared/data'))
+#: of the stage whose parameters are drawn again and again: steps, noise and a triangle
+PROGRAM = """
+limits: [0, 10]
+rest: 0
+slew: 200
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 6}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 1}
+  - {signal: triangle, slope: 60}
+  - {signal: idle, duration: 0.1}
+"""
+
+
+@dataclass(frozen=True)
+class Todo:
+    """A stage to judge: `what` is 'identified', 'diagnosed', or the name of a measured record."""
+
+    what: str
+    number: int
+
+    @property
+    def key(self) -> str:
+        """Name in the file."""
+        return f'{self.what} {self.number}'
+
+
+@dataclass(frozen=True)
+class Covered:
+    """
+    What came out; errors in % of stroke.
+
+    `kinds` holds for each segment its kind, the shares inside at `LEVELS`, the mean half width at
+    0.9 over the half width that holds 90 %, and the share of samples that are not known.
+    """
+
+    key: str
+    kinds: tuple[tuple[str, tuple[float, ...], float, float], ...] = ()
+    same: tuple[float, float] = (np.nan, np.nan)
+    other: tuple[float, float] = (np.nan, np.nan)
+    noise: float = np.nan
+    weight: float = np.nan
+    is_right: bool = False
+    error: str = ''
+
+
+def case_of(todo: Todo) -> Case:
+    """Return the case of a number, with a seed of this draw."""
+    case = replace(draw(GROUP, todo.number % 216), seed=SEED + todo.number, fault='', poorer='')
+    if todo.what == 'identified':
+        return replace(case, effects=(), factors=(), idle_channel=False)
+    return case
+
+
+def judged(todo: Todo) -> Covered:
+    """Run one stage."""
+    try:
+        if todo.what.endswith('.csv'):
+            return _measured(todo)
+        return _identified(todo) if todo.what == 'identified' else _diagnosed(todo)
+    # one failed stage must not end hours of others
+    except Exception as error:  # noqa: BLE001
+        return Covered(todo.key, error=f'{type(error).__name__}: {error}')
+
+
+def _identified(todo: Todo) -> Covered:
+    records = case_records(case_of(todo), forms=False)
+    result = pi.identify(records.identification)
+    again = _again(records.stage, records.identification)
+    same, other = (result.model.score(r).percent for r in (again, records.unseen))
+    # what the sensor adds: to a displacement of zero, so that its steps count, too
+    v = records.identification.pieces[0].v
+    clean = records.stage.respond(v, 'identification', {}, clean=True)
+    noise = 100.0 * float(np.std(records.stage.read(clean, 'identification') - clean))
+    return Covered(
+        todo.key,
+        tuple(_kinds(result.model, records.unseen)),
+        (same, result.promise.same),
+        (other, result.promise.other),
+        (result.noise_floor or np.nan) / noise,
+    )
+
+
+def _diagnosed(todo: Todo) -> Covered:
+    records = case_records(case_of(todo), forms=False)
+    result = pi.diagnose(pi.identify(records.identification).model, records.diagnosis)
+    other = result.model.score(records.unseen).percent
+    same = np.nan
+    if not any(piece.channels for piece in records.diagnosis):
+        same = result.model.score(_again(records.stage, records.diagnosis)).percent
+    name = '+'.join(sorted(e.name for e in result.effects)) or NOTHING
+    truth = '+'.join(sorted(records.truth)) or NOTHING
+    return Covered(
+        todo.key,
+        tuple(_kinds(result.model, records.unseen)),
+        (same, result.promise.same),
+        (other, result.promise.other),
+        weight=result.weights.get(name, np.nan),
+        is_right=name == truth,
+    )
+
+
+def _measured(todo: Todo) -> Covered:
+    name, share = next(x for x in MEASURED if x[0] == todo.what)
+    record = pi.read(DATA / name)
+    (piece,) = record.pieces
+    at = round(share * piece.n)
+    result = pi.identify(pi.Record((piece.cut(0, at),), name))
+    rest = pi.Record((piece.cut(at, piece.n),), f'rest of {name}')
+    error = result.model.score(rest).percent
+    kinds = tuple(_kinds(result.model, rest))
+    return Covered(todo.key, kinds, (error, result.promise.same), (error, result.promise.other))
+
+
+def _again(stage: FamilyStage, record: pi.Record) -> pi.Record:
+    """Measure the same motion once more, with another noise, phase and past."""
+    (piece,) = record.pieces
+    y = stage.respond(piece.v, 'again')
+    again = Piece(piece.v, y, piece.sample_rate, segments=piece.segments)
+    return pi.Record((again,), 'again')
+
+
+def _kinds(
+    model: pi.StageModel, record: pi.Record
+) -> Iterator[tuple[str, tuple[float, ...], float, float]]:
+    """Yield the coverage of each kind of motion of a record, behind its unknown start."""
+    runs = [model.predict(record, level) for level in LEVELS]
+    for i, piece in enumerate(runs[0].record):
+        e = np.abs(piece.y - runs[0].pieces[i])
+        judged = piece.mask & (np.arange(piece.n) >= runs[0].late[i])
+        for label, start, stop in [(s.label, s.start, s.stop) for s in piece.segments] or [
+            (f'part {k + 1}', k * piece.n // 8, (k + 1) * piece.n // 8) for k in range(8)
+        ]:
+            own = np.zeros(piece.n, dtype=bool)
+            own[start:stop] = judged[start:stop]
+            if own.sum() < 20:
+                continue
+            known = own & np.isfinite(runs[MAIN].half_widths[i])
+            unknown = 1.0 - known.sum() / own.sum()
+            kind = label.partition(':')[0].partition(' ')[0]
+            if not known.any():
+                yield kind, (), np.nan, unknown
+                continue
+            inside = tuple(float(np.mean((e <= r.half_widths[i])[known])) for r in runs)
+            oracle = max(float(np.quantile(e[known], LEVELS[MAIN])), 1e-15)
+            yield kind, inside, float(runs[MAIN].half_widths[i][known].mean()) / oracle, unknown
+
+
+# -- parameters ----------------------------------------------------------------------------------
+
+
+def drawn_parameters(count: int) -> list[tuple[str, str, float, float, float]]:
+    """
+    Identify one stage with `count` draws of its noise.
+
+    The result holds for each quantity its kind, its name, the share of 95 % intervals that hold
+    the truth, the scatter over the stated deviation, and the bias over the scatter.
+    """
+    stage = pi.SimulatedStage.load('paper')
+    program = parse_program(PROGRAM)
+    found: dict[str, list[tuple[float, float]]] = {}
+    truth: dict[str, float] = {}
+    for k in range(count):
+        result = pi.identify(replace(stage, seed=SEED + k).play(program))
+        for p in result.model.quantities:
+            found.setdefault(f'{p.part} {p.name}', []).append((float(p.value), p.std or np.nan))
+        truth = truth or {
+            f'{p.part} {p.name}': float(p.value) for p in quantities_of(stage.model, result)
+        }
+    rows = []
+    for name, draws in found.items():
+        value, std = np.array(draws).T
+        if name not in truth or value.size < count:
+            continue
+        scatter, bias = float(value.std(ddof=1)), float(value.mean() - truth[name])
+        held = float(np.mean(np.abs(value - truth[name]) <= 2.0 * std))
+        kind = name.partition(' at ')[0]
+        kind = 'modes' if 'mode' in name else kind
+        rows.append((kind, name, held, scatter / float(np.median(std)), bias / scatter))
+    return rows
+
+
+# -- the page ------------------------------------------------------------------------------------
+
+
+def _spread(values: Sequence[float]) -> str:
+    known = np.array(values)[np.isfinite(values)]
+    if not known.size:
+        return '–'
+    return f'{np.median(known):.2f} | {np.quantile(known, 0.9):.2f}'
+
+
+def _coverage(rows: Sequence[Covered]) -> Iterator[tuple[object, ...]]:
+    by_kind: dict[str, list[tuple[tuple[float, ...], float, float]]] = {}
+    for row in rows:
+        for kind, inside, ratio, unknown in row.kinds:
+            by_kind.setdefault(kind, []).append((tuple(inside), ratio, unknown))
+    for kind, cells in {**by_kind, 'all': [c for own in by_kind.values() for c in own]}.items():
+        held = [c for c in cells if c[0]]
+        if held:
+            shares = np.mean([c[0] for c in held], axis=0)
+            ratio = np.exp(np.mean(np.log([c[1] for c in held])))
+            lost = np.mean([c[2] for c in cells])
+            yield (
+                kind,
+                len(held),
+                *(f'{100 * s:.0f}' for s in shares),
+                f'{ratio:.2f}',
+                f'{lost:.0%}',
+            )
+
+
+def _low(rows: Sequence[Covered]) -> str:
+    own = [np.mean([k[1][MAIN] for k in row.kinds if k[1]]) for row in rows if row.kinds]
+    return part_of(sum(x < 0.6 for x in own), len(own))
+
+
+def _weights(rows: Sequence[Covered]) -> str:
+    known = sorted((r.weight, r.is_right) for r in rows if np.isfinite(r.weight))
+    if len(known) < 5:
+        return 'Too few diagnoses for the calibration of weights.'
+    w, right = np.array(known, dtype=np.float64).T
+    bins = np.array_split(np.arange(w.size), 5)
+    error = sum(b.size * abs(w[b].mean() - right[b].mean()) for b in bins) / w.size
+    brier, base = float(np.mean((w - right) ** 2)), float(right.mean() * (1.0 - right.mean()))
+    return (
+        f'Weight of the first verdict, {w.size} diagnoses in five bins of equal count: expected '
+        f'calibration error {error:.2f} (wanted 0.07); Brier score {brier:.3f}, of the base rate '
+        f'{base:.3f}. Right, set for set: {part_of(int(right.sum()), right.size)}.'
+    )
+
+
+def page(rows: Sequence[Covered], parameters: Sequence[tuple[object, ...]], draws: int) -> str:
+    """Return the page."""
+    groups = {
+        what: [r for r in rows if r.key.startswith(what) and not r.error]
+        for what in ('identified', 'diagnosed')
+    }
+    measured = [r for r in rows if '.csv' in r.key and not r.error]
+    heads = 'motion, segments, ' + ', '.join(f'{100 * p:g} %' for p in LEVELS)
+    parts = [
+        '# Coverage',
+        'Whether [bands, promises and weights](bands.md) hold on stages of families that the '
+        f'model lacks (`benchmarks/truths`, group {GROUP}), one draw of seeds from {SEED} on that '
+        'nobody had used. `make coverage` writes this page. This run: '
+        f'**{len(groups["identified"])} identified stages, {len(groups["diagnosed"])} diagnosed '
+        f'ones, {len(measured)} measured records, {draws} draws of parameters**, '
+        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 100. '
+        f'{machine()}.',
+        '![Nominal against measured coverage by kind of motion](images/coverage.png)',
+    ]
+    for what, own in groups.items():
+        title = f'Prediction bands, {what} stages'
+        parts.append(
+            section(title, f'{heads}, width / oracle, not known', _coverage(own))
+            + '\n\nWidth / oracle: mean half width at 90 % over the constant half width of the '
+            f'segment that holds 90 %, geometric mean. Stages below 60 %: {_low(own)}.'
+        )
+    parts.append(
+        section(
+            'Bands on measured records', f'{heads}, width / oracle, not known', _coverage(measured)
+        )
+    )
+    told = [
+        (what, len(own), *(_spread([s[0] / s[1] for s in pairs]) for pairs in both))
+        for what, own in {**groups, 'measured': measured}.items()
+        for both in [([r.same for r in own], [r.other for r in own])]
+    ]
+    parts.append(
+        section(
+            'Promises: error of another record over the promised one, median \\| 90th percentile',
+            'stages, number, same motion, other motion',
+            [tuple(str(c).replace(' | ', ' \\| ') for c in row) for row in told],
+        )
+    )
+    parts.append(f'## Weights\n\n{_weights(groups["diagnosed"])}')
+    noise = [r.noise for r in groups['identified'] if np.isfinite(r.noise)]
+    near = sum(1 / 1.5 <= x <= 1.5 for x in noise)
+    parts.append(
+        f'## Sensor noise\n\nStated over true: median {np.median(noise or [np.nan]):.2f}; within '
+        f'1.5 times of the truth: {part_of(near, len(noise))}.'
+    )
+    kinds = dict.fromkeys(p[0] for p in parameters)
+    table = [
+        (kind, len(own), *(f'{f([p[i] for p in own]):.2f}' for i, f in columns))
+        for kind in kinds
+        for own in [[p for p in parameters if p[0] == kind]]
+        for columns in [((2, np.mean), (2, np.min), (3, np.median), (3, np.max), (4, np.median))]
+    ]
+    parts.append(
+        section(
+            f'Parameters: 95 % intervals against the truth, {draws} draws of white noise',
+            'quantity, number, held, least held, scatter / stated, largest, bias / scatter',
+            table,
+        )
+    )
+    return '\n\n'.join(parts) + '\n'
+
+
+def picture(rows: Sequence[Covered], target: Path) -> None:
+    """Draw nominal against measured coverage by kind of motion."""
+    fig = style.figure(4.2, 5.2)
+    axes = fig.subplots()
+    axes.plot([0, 1], [0, 1], color=style.GREY, linewidth=0.8)
+    for kind, n, *shares, _, _ in _coverage([r for r in rows if not r.error]):
+        values = [float(s) / 100.0 for s in shares]
+        axes.plot(
+            LEVELS,
+            values,
+            'o-',
+            markersize=3,
+            linewidth=2.2 if kind == 'all' else 0.9,
+            label=f'{kind} ({n})',
+        )
+    style.tidy(axes, 'nominal coverage', 'measured coverage')
+    style.legend(axes, loc='upper left', ncols=2)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(target, dpi=style.DPI)
+
+
+def main() -> None:
+    """Run the study and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
+    parser.add_argument('page', type=Path)
+    parser.add_argument('--picture', type=Path, default=Path('docs/images/coverage.png'))
+    parser.add_argument('--identified', type=int, default=200, help='number of stages')
+    parser.add_argument('--diagnosed', type=int, default=100, help='number of stages')
+    parser.add_argument('--draws', type=int, default=100, help='draws of parameters')
+    parser.add_argument('--processes', type=int, default=os.cpu_count() or 1)
+    parser.add_argument('--kept', type=Path, default=Path('build/coverage.jsonl'))
+    args = parser.parse_args()
+    todo = [Todo(name, 0) for name, _ in MEASURED if (DATA / name).exists()]
+    todo += [Todo('identified', k) for k in range(args.identified)]
+    todo += [Todo('diagnosed', k) for k in range(args.diagnosed)]
+    rows = all_rows(args.kept, Covered, todo, judged, args.processes)
+    own = [rows[one.key] for one in todo if one.key in rows]
+    parameters = drawn_parameters(args.draws) if args.draws > 1 else []
+    args.page.write_text(page(own, parameters, args.draws), encoding='utf-8')
+    picture(own, args.picture)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,73 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Errors of a model sample by sample, and what they promise for other records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.fitting.free_run import Fit
+from piezo_ident.record.record import Piece
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedRun:
+    """
+    Free run of a model on one piece, with its errors.
+
+    Attributes
+    ----------
+    record : str
+    piece : Piece
+    predicted : ndarray, shape (n,)
+        Displacement [m].
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    held : ndarray of bool, shape (n,)
+        Samples that no fit of the judged model used.
+    """
+
+    record: str
+    piece: Piece
+    predicted: Array
+    use: Mask
+    held: Mask
+
+    @property
+    def error(self) -> Array:
+        """Measured minus predicted displacement [m], shape (n,)."""
+        return np.asarray(self.piece.y - self.predicted)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """
+    What promise, band and deviations of an identification follow from.
+
+    `fit` is the fit of all parameters together; None if the model was identified in steps.
+    """
+
+    runs: tuple[JudgedRun, ...]
+    fit: Fit | None = None
+
+
+@dataclass(frozen=True)
+class Promise:
+    """
+    Expected free-run errors on another record of the same stage, % of stroke.
+
+    `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
+    within the swings and speeds of these records.  What follows time, such as hum or a drift, is
+    in the other record, too, and in no model.
+    """
+
+    same: float
+    other: float
+
+    @property
+    def told(self) -> str:
+        """The promise in words."""
+        return f'{self.same:.3g} % of stroke, {self.other:.3g} % on another kind of motion'

@@ -1,0 +1,176 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Bound the error of a free run by a half width that follows the motion.
+
+The scale of the error is
+
+    q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2,
+
+in spans, with swing S and speed D of `piezo_ident.uncertainty.motion`.  r_k^2 is the mean
+square of error over q of kind k of K, with the coefficients that the other kinds give.  Errors
+within a kind are alike, so a kind counts as one observation with the mean zero.  The half width
+at level p holds one more observation:
+
+    q lambda,        lambda = t_K((1 + p) / 2) sqrt(1 + 1/K) sqrt(mean r_k^2),
+
+with the quantile t_K of Student's distribution with K degrees of freedom (W. Q. Meeker, G. J. Hahn
+and L. A. Escobar, Statistical Intervals, 2nd ed., 2017, section 4.7,
+doi:10.1002/9781118594841).  So p is a share of the samples over kinds of motion, not of the
+samples of one record: a whole record may leave its band.
+
+Limits: the band holds for the stage as it was when the record was made, with the zero of its
+sensor.  Outside the excited range of the voltage it widens by the distance, as the slope of H is
+unknown there.  It is infinite, which means not known, `FAR` outside the range or at `FAST` times
+the highest speed of the records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ConfigError, ModelError
+from piezo_ident.model.initial_memory import creep_elements
+from piezo_ident.model.memory_bounds import MemoryBounds
+from piezo_ident.model.observer import BEYOND
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.uncertainty.motion import Motion
+from scipy.stats import t as student
+
+#: entry of a model file, below `identification`
+KEY = 'prediction_band'
+#: distance outside the excited range from which nothing is known, as a share of the range; taste
+FAR = 0.25
+#: speed from which nothing is known, over the highest speed of the records; taste
+FAST = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class PredictionBand:
+    """
+    Half width of the error of a free run as a function of the motion.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (3,)
+        c_0, c_S and c_D in spans.
+    kinds : int
+        Number of kinds of motion, K.
+    ratio : float
+        Rms of the ratios r_k.
+    speed : float
+        Highest speed of the records [spans/s].
+    """
+
+    coefficients: Array
+    kinds: int
+    ratio: float
+    speed: float
+
+    def scale(self, motion: Array) -> Array:
+        """Compute q of swing and speed, shape (2, n)."""
+        c, (swing, speed) = self.coefficients, motion
+        return np.asarray(np.sqrt(c[0] ** 2 + (c[1] * swing) ** 2 + (c[2] * speed) ** 2))
+
+    def factor(self, level: float) -> float:
+        """Compute lambda, the half width over q at a level."""
+        if not 0.0 < level < 1.0:
+            raise ConfigError(f'interval must lie between 0 and 1, got {level:g}')
+        quantile = float(student.ppf(0.5 + 0.5 * level, self.kinds))
+        return quantile * math.sqrt(1.0 + 1.0 / self.kinds) * self.ratio
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to plain data for a model file."""
+        return {**vars(self), 'coefficients': self.coefficients.tolist()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PredictionBand:
+        """Read a band of a model file; raise ModelError if it is damaged."""
+        try:
+            c, kinds = np.array(data['coefficients'], dtype=np.float64), int(data['kinds'])
+            band = cls(c, kinds, float(data['ratio']), float(data['speed']))
+            is_sound = (
+                c.shape == (3,)
+                and kinds > 0
+                and np.isfinite([*c, *list(vars(band).values())[2:]]).all()
+            )
+        except (KeyError, TypeError, ValueError):
+            is_sound = False
+        if not is_sound:
+            raise ModelError(f'{KEY}: is damaged; identify again')
+        return band
+
+
+def band_of(model: StageModel) -> PredictionBand:
+    """Read the band of a model; raise ModelError if the model carries none."""
+    data = model.identification.get(KEY)
+    if not isinstance(data, Mapping):
+        raise ModelError(
+            'the model carries no prediction band: it was made by hand, or before bands were '
+            'kept; identify the stage again to get one'
+        )
+    return PredictionBand.from_dict(data)
+
+
+class BandStream:
+    """
+    Half width of a stream of predictions, block by block.
+
+    `plays` and `creep` tell whether the memory of the plays, and the creep from before, are known
+    at the start.  Otherwise the band contains what the plays may remember, until the voltage has
+    swept them, and the creep that may go on.  Raises ModelError if the model carries no band, and
+    ConfigError if the level does not lie between 0 and 1.
+    """
+
+    def __init__(
+        self, model: StageModel, level: float, *, plays: bool = True, creep: bool = True
+    ) -> None:
+        self._model, self._level, self._plays = model, level, plays
+        self._band = band_of(model)
+        self._factor = self._band.factor(level)
+        self._motion = Motion(model)
+        low, high = model.scaling.u(np.array(model.scaling.range)).tolist()
+        self._low, self._high = low, high
+        h = model.hysteresis
+        self._slope = abs(float(np.ptp(h(np.array([low, high])))) / (high - low))
+        self._bounds: MemoryBounds | None = None
+        shares, times = creep_elements(model)
+        reach = BEYOND * float(np.ptp(h(np.linspace(low, high, 65))))
+        self._creep = (reach * shares, times) if shares.size and not creep else None
+        self._count = 0
+
+    def follow(self, v: Array, y: Array) -> Array:
+        """Compute the half width at voltages [V] and predictions [m]; infinite if not known."""
+        model, band = self._model, self._band
+        if not v.size:
+            return np.empty(0)
+        u = model.scaling.u(v)
+        motion = self._motion.follow(u, model.scaling.x(y))
+        beyond = np.maximum(np.maximum(self._low - u, u - self._high), 0.0)
+        half = self._factor * np.hypot(band.scale(motion), self._slope * beyond)
+        half = half + self._level * self._of_start(u)
+        far = beyond > FAR * (self._high - self._low)
+        half[far | (motion[1] > FAST * band.speed)] = np.inf
+        return np.asarray(half * abs(model.scaling.Y))
+
+    def _of_start(self, u: Array) -> Array:
+        """Compute what the unknown start may still change, normalised, shape (n,)."""
+        gain, left = self._model.dynamics.gain, np.zeros(u.size)
+        if not self._plays:
+            if self._bounds is None:
+                span = self._low, self._high
+                self._bounds = MemoryBounds(self._model.hysteresis, float(u[0]), span)
+            left = gain * self._bounds.follow(u)
+        if self._creep is not None:
+            sizes, times = self._creep
+            t = (self._count + np.arange(u.size)) / self._model.sample_rate
+            faded = sizes[:, None] * np.exp(-t / times[:, None])
+            left = left + gain * np.sqrt(np.sum(faded**2, axis=0))
+        self._count += u.size
+        return np.asarray(left)

@@ -1,0 +1,91 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Describe motion sample by sample by what makes a free run err: its swing and its speed.
+
+- Swing: the distance between the last two turning points of the voltage, or from the last of them
+  to the voltage, whichever is larger.  The misfit of H grows with the loop that is travelled.
+- Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
+  of G.  The misfit of G and of the delay grows with it.
+
+Both follow from the past alone, so a stream gives the same values as a whole record.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.kernel import alive, ordered_kernel
+from piezo_ident.model.stage_model import StageModel
+
+#: way back after which an extreme of the voltage counts as a turning point, as a share of the
+#: range: above the noise of a measured voltage, below a loop whose error matters (taste)
+TURN = 2e-3
+#: shortest and longest time in which the speed of the past fades [samples, s]; taste
+FEWEST, LONGEST = 10.0, 0.1
+
+
+class Motion:
+    """
+    Swing and speed of a stream of samples.
+
+    Parameters
+    ----------
+    model : StageModel
+        Gives the sampling rate, and the ringing time of G.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> motion = Motion(pi.SimulatedStage.load('paper').model)
+    >>> motion.follow(np.array([0.0, 0.5, 1.0, 0.7]), np.zeros(4))[0].tolist()
+    [0.0, 0.5, 1.0, 1.0]
+    """
+
+    def __init__(self, model: StageModel) -> None:
+        rate, radius = model.sample_rate, model.dynamics.radius
+        ringing = FEWEST if radius <= 0.0 else -1.0 / np.log(radius)
+        self._fades = float(np.exp(-1.0 / np.clip(ringing, FEWEST, max(FEWEST, LONGEST * rate))))
+        self._rate = rate
+        self._state: Array | None = None
+
+    def follow(self, u: Array, x: Array) -> Array:
+        """
+        Describe the next samples.
+
+        Parameters
+        ----------
+        u, x : ndarray, shape (n,)
+            Voltage and predicted displacement, normalised.
+
+        Returns
+        -------
+        ndarray, shape (2, n)
+            Swing, normalised, and speed [spans/s].
+        """
+        out = np.empty((2, u.size))
+        if not u.size:
+            return out
+        if self._state is None:
+            self._state = np.array([1.0, u[0], u[0], u[0], 0.0, x[0]])
+        _described(u, x, TURN, self._fades, self._rate, self._state, out)
+        return out
+
+
+@ordered_kernel
+def _described(
+    u: Array, x: Array, turn: float, fades: float, rate: float, state: Array, out: Array
+) -> None:
+    """Write swing and speed into `out`; the state is direction, extreme, two turns, speed, x."""
+    rising, extreme, last, before, speed, past = state
+    for k in range(u.size):
+        if (u[k] - extreme) * rising >= 0.0:
+            extreme = u[k]
+        elif (extreme - u[k]) * rising > turn:
+            before, last, extreme, rising = last, extreme, u[k], -rising
+        out[0, k] = max(abs(last - before), abs(u[k] - last))
+        speed = max(alive(speed * fades), abs(x[k] - past) * rate)
+        past = x[k]
+        out[1, k] = speed
+    state[:] = np.array([rising, extreme, last, before, speed, past])

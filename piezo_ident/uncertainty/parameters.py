@@ -1,0 +1,136 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+State the quantities that a user reads from a model, with their standard deviations.
+
+Each deviation is that of another record of the same motion and noise, from the replicates of
+`piezo_ident.fitting.jackknife`.  A 95 % interval is the value with Student's quantile for one
+degree of freedom fewer than blocks, about twice the deviation, to either side.
+
+Limits: the delay is a whole number of samples and does not vary in these equations.  The error of
+the law of H is in the deviations as far as it differs from block to block; a part that all blocks
+share is a bias, and no record of the same motion shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+import math
+from typing import Any
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.fitting.jackknife import deviations
+from piezo_ident.fitting.stage import Stage
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.front_door import ModelParameter
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.uncertainty.linearised import linearised, stage_of
+
+#: entries of a model file, below `identification`
+QUANTITIES, PARAMETERS = 'quantities', 'uncertainties'
+#: number of frequencies at which G is stated, and the lowest as a share of the highest (taste)
+FREQUENCIES, LOWEST = 10, 1e-2
+#: swings at which the width of the loop is stated, as shares of the range
+SWINGS = (0.25, 0.5, 1.0)
+#: points of a quarter of a loop
+POINTS = 100
+#: farthest replica of a mode, as a share of its frequency: beyond this it is another mode
+SAME_MODE = 0.2
+
+
+def with_deviations(result: Identification) -> Identification:
+    """Add quantities and deviations to the model of an identification."""
+    try:
+        fitted = linearised(result)
+    except IdentificationError:
+        # equations without a solution tell nothing
+        fitted = None
+    if fitted is None:
+        return result
+    model, frequencies = result.model, _frequencies(result)
+    near = fitted.stage.dynamics
+    rows = list(_quantities(fitted.stage, model, frequencies, near))
+    at = np.array([row.value for row in rows], dtype=np.float64)
+    found = []
+    for stage in fitted.replicates():
+        moved = [row.value for row in _quantities(stage, model, frequencies, near)]
+        found.append(np.concatenate([moved, _coefficients(stage)]))
+    whole = np.concatenate([at, _coefficients(fitted.stage)])
+    std = deviations(np.array(found).reshape(-1, whole.size), whole)
+    # what a replicate lacks, such as a mode, is not known
+    told = np.where(np.isfinite(std), std, np.inf)
+    quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=False)]
+    known = {**model.identification, QUANTITIES: quantities}
+    known[PARAMETERS] = _of_coefficients(fitted.stage, model, std[at.size :], known)
+    return replace(result, model=replace(model, identification=known))
+
+
+def quantities_of(model: StageModel, result: Identification) -> list[ModelParameter]:
+    """List the quantities of a sum of plays, such as a simulated stage, as those of a result."""
+    near = result.model.dynamics
+    return list(_quantities(stage_of(model, 'plays'), model, _frequencies(result), near))
+
+
+def _frequencies(result: Identification) -> Array:
+    highest = min(result.dynamics.known_to, 0.5 * result.model.sample_rate)
+    return np.geomspace(LOWEST * highest, highest, FREQUENCIES)
+
+
+def _coefficients(stage: Stage) -> Array:
+    """Return weights, p0, p1 and p2 of H, and a and b of G."""
+    h, G = stage.hysteresis, stage.dynamics
+    return np.concatenate([h.weights, [h.p0, h.p1, h.p2], G.a, G.b])
+
+
+def _of_coefficients(
+    stage: Stage, model: StageModel, std: Array, known: dict[str, Any]
+) -> dict[str, Any]:
+    """Replace the deviations of single steps by those of all parameters together."""
+    m, na = stage.law.thresholds.size, stage.dynamics.a.size
+    own = np.isin(stage.law.thresholds, model.hysteresis.thresholds)
+    weights, powers, a, b = np.split(std, [m, m + 3, m + 3 + na])
+    found = {**known.get(PARAMETERS, {}), 'weights': weights[own].tolist()}
+    found |= dict(zip(('p0', 'p1', 'p2'), powers.tolist(), strict=True))
+    return found | ({'a': a.tolist(), 'b': b.tolist()} if na == model.dynamics.a.size else {})
+
+
+def _quantities(
+    stage: Stage, model: StageModel, frequencies: Array, near: Dynamics
+) -> Iterator[ModelParameter]:
+    """Yield the quantities of a stage; modes are the nearest to those of `near`."""
+    s, rate, h, G = model.scaling, model.sample_rate, stage.hysteresis, stage.dynamics
+    low, high = s.u(np.array(s.range)).tolist()
+    line = float(np.diff(h(np.array([low, high])))[0] / (high - low))
+    yield ModelParameter('H', 'static gain', abs(line * s.Y / s.V), 'm/V')
+    for share in SWINGS:
+        size = share * (high - low)
+        width = abs(s.Y) * _loop_width(stage, 0.5 * (low + high - size), size)
+        yield ModelParameter('H', f'loop width at {share:.0%} of the range', width, 'm')
+    if not G.is_static:
+        response = G.response(frequencies, rate)
+        phase = np.unwrap(np.angle(response))
+        for f, gain, angle in zip(frequencies, np.abs(response), phase, strict=True):
+            yield ModelParameter('G', f'gain at {f:.4g} Hz', float(gain), '')
+            yield ModelParameter('G', f'phase at {f:.4g} Hz', math.degrees(angle), 'deg')
+        modes = G.modes(rate)
+        for i, mode in enumerate(near.modes(rate), 1):
+            far = [abs(x.frequency / mode.frequency - 1.0) for x in modes]
+            same = modes[int(np.argmin(far))] if far and min(far) < SAME_MODE else None
+            yield ModelParameter('G', f'mode {i}', same.frequency if same else math.nan, 'Hz')
+            yield ModelParameter(
+                'G', f'damping of mode {i}', same.damping if same else math.nan, ''
+            )
+    for tau, share in zip(stage.taus, stage.creep, strict=True):
+        yield ModelParameter('creep', f'gain at {tau:.4g} s', float(share), '')
+
+
+def _loop_width(stage: Stage, low: float, size: float) -> float:
+    """Return the width of a loop in its middle, normalised; it is closed after one cycle."""
+    up = np.linspace(low, low + size, 2 * POINTS + 1)
+    w = stage.hysteresis(np.concatenate([up, up[-2::-1], up[1:], up[-2::-1]]))
+    return float(w[7 * POINTS] - w[5 * POINTS])

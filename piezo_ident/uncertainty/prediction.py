@@ -1,0 +1,63 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Give predicted records their band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.model.free_run import FreeRun
+from piezo_ident.model.initial_memory import is_at_rest
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.readings.gaps import connected_pieces
+from piezo_ident.record.record import Record
+from piezo_ident.uncertainty.band import BandStream, FAR, FAST
+
+
+def half_widths(
+    model: StageModel,
+    record: Record,
+    predicted: Sequence[Array],
+    level: float,
+    estimated: Sequence[bool] | None = None,
+) -> tuple[Array, ...]:
+    """
+    Compute the half width of the band of each piece of a record [m].
+
+    `estimated` tells for each piece whether its displacement gave the start.  Then the plays may
+    err until they are forgotten.  Without `estimated` the voltage alone is known: the plays are
+    known from a start at rest, and the creep from before is not.
+    """
+    found = list[Array]()
+    for pieces in connected_pieces(record):
+        first = len(found)
+        if estimated is None:
+            stream = BandStream(model, level, plays=is_at_rest(model, pieces[0]), creep=False)
+        else:
+            stream = BandStream(model, level, plays=not estimated[first])
+        for piece in pieces:
+            found.append(stream.follow(piece.v, predicted[len(found)]))
+    return tuple(found)
+
+
+def with_interval(model: StageModel, run: FreeRun, level: float) -> FreeRun:
+    """Add the band to a free run, and a warning where nothing is known."""
+    half = half_widths(model, run.record, run.pieces, level, run.estimated)
+    warnings = [f'{run.record.name}: {text}' for text in unknown_parts(half)]
+    return replace(run, interval=level, half_widths=half, warnings=(*run.warnings, *warnings))
+
+
+def unknown_parts(half: Sequence[Array]) -> list[str]:
+    """Say for which share of the samples the error is not known; empty if it is known for all."""
+    n, lost = sum(x.size for x in half), sum(int(np.isinf(x).sum()) for x in half)
+    if not lost:
+        return []
+    return [
+        f'the error is not known for {100.0 * lost / n:.2g} % of the samples: their voltage lies '
+        f'more than {FAR:.0%} outside the range of the model, or they move more than {FAST:g} '
+        'times as fast as the records that the band comes from'
+    ]

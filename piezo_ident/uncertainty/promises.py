@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Promise the error of another record, and give the model its prediction band.
+
+The promise for the same kinds of motion is the rms error of the model on its records, with what
+samples held out err more than samples fitted.  The promise for motion of another kind is the rms
+of the scale of the band over all pairs of a swing of one kind and a speed of another, times the
+ratio by which kinds that were left out exceed this scale (`piezo_ident.uncertainty.band`).
+
+After a diagnosis the errors are those of the refined model in free run.  This model carries
+nothing that follows time alone, such as hum, drift and a wandering gain, so the records count them
+in full.
+
+Limits: both are rms values over the whole record, in % of the stroke of the records that they
+come from.  The zero of the sensor does not count where it has clearly moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.diagnosis.criteria import MOVED_ZERO
+from piezo_ident.diagnosis.held_out import stretches
+from piezo_ident.diagnosis.messages import sentence
+from piezo_ident.diagnosis.results import Diagnosis, Errors
+from piezo_ident.identification.results import Identification
+from piezo_ident.model.initial_memory import fit_start
+from piezo_ident.model.metrics import percent
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.selection.judged import JudgedRun, Promise
+from piezo_ident.uncertainty.band import KEY, PredictionBand
+from piezo_ident.uncertainty.calibration import Blocks, blocks_of, calibrated
+from piezo_ident.uncertainty.parameters import QUANTITIES
+from piezo_ident.uncertainty.weights import weights_of
+
+
+def with_band(model: StageModel, band: PredictionBand) -> StageModel:
+    """Keep a band in the model, and so in its file."""
+    return replace(model, identification={**model.identification, KEY: band.to_dict()})
+
+
+def promised_identification(result: Identification) -> Identification:
+    """Add promise and band to an identification."""
+    judged, model = result.judged, result.model
+    blocks = None if judged is None else blocks_of(model, judged.runs)
+    if blocks is None:
+        return result
+    band = calibrated(blocks)
+    promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
+    return replace(result, model=with_band(model, band), promise=promise)
+
+
+def promised_diagnosis(result: Diagnosis) -> Diagnosis:
+    """Add weights, promise and band to a diagnosis, and the promise to its sentence."""
+    model = result.model
+    result = replace(result, weights=weights_of(result.errors_of_sets, len(result.kinds)))
+    stroke = max(float(np.ptp(r.piece.y[r.sound])) for r in result.residuals if r.sound.any())
+    runs = _elsewhere(result)
+    same, other = (
+        blocks_of(model, runs, _excess(result, errors, stroke))
+        for errors in (result.held_out, result.after)
+    )
+    if same is None or other is None:
+        return result
+    band = calibrated(other)
+    promise = _promise(same, other, band, abs(model.scaling.Y), stroke)
+    if result.changes:
+        # the deviations are those of the model as given
+        known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
+        model = replace(model, identification=known)
+    result = replace(result, model=with_band(model, band), promise=promise)
+    return replace(result, sentence=sentence(result))
+
+
+def _promise(
+    same: Blocks, other: Blocks, band: PredictionBand, span: float, stroke: float
+) -> Promise:
+    mean = float(np.average(same.square, weights=same.weight))
+    swing, speed = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2))
+    pairs = np.array([x.ravel() for x in np.meshgrid(swing, speed)])
+    expected = band.ratio * math.sqrt(float(np.mean(band.scale(pairs) ** 2)))
+    return Promise(percent(span * math.sqrt(mean), stroke), percent(span * expected, stroke))
+
+
+def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
+    """Run the refined model as on records that it never saw, at the zero of each record."""
+    runs = []
+    for r in result.residuals:
+        y = result.model.predict_piece(r.piece, fit_start(result.model, r.piece, r.sound))
+        runs.append(JudgedRun(r.record, r.piece, y, r.sound, np.zeros(y.size, dtype=bool)))
+    moved = {}
+    for name in result.records:
+        e = np.concatenate([run.error[run.use] for run in runs if run.record == name])
+        is_clear = e.size and abs(e.mean()) > MOVED_ZERO * e.std()
+        moved[name] = float(e.mean()) if is_clear else 0.0
+    return [replace(run, predicted=run.predicted + moved[run.record]) for run in runs]
+
+
+def _excess(result: Diagnosis, errors: Errors | None, stroke: float) -> dict[str, float]:
+    """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
+    held, fitted = {} if errors is None else errors.by_segment, dict[str, list[Array]]()
+    for r in result.residuals:
+        for label, start, stop in stretches(r.record, r.piece):
+            if label in held:
+                fitted.setdefault(label, []).append(r.after[start:stop][r.sound[start:stop]])
+    return {
+        label: max((0.01 * held[label] * stroke) ** 2 - float(np.concatenate(e).var()), 0.0)
+        for label, e in fitted.items()
+    }

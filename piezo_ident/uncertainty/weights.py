@@ -1,0 +1,68 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Weigh the candidates of a diagnosis by their errors on kinds of motion that were held out.
+
+A set s of effects that leaves the mean square E_s predicts the held-out data of N kinds of motion,
+each of which counts as one observation of unknown size.  Its weight is
+
+    w_s = p_s E_s^(-N/2) / sum of all,
+
+pseudo Bayesian model averaging: Y. Yao, A. Vehtari, D. Simpson and A. Gelman, "Using stacking to
+average Bayesian predictive distributions", Bayesian Analysis 13(3), 2018, doi:10.1214/17-BA1091.
+
+``none of these`` stands for a stage that lacks nothing, and for a cause outside of the catalogue.
+Its E is the error without an effect times `TAKES`: a set that removes less than a cause must
+remove is less likely than none.  The prior of none is `NONE`.  A further effect is `FURTHER` times
+as likely as the first one, and sets of one size are equally likely.
+
+Limits: E_s is known to the number of kinds alone, and the sets compared are those that the search
+fitted.  The weights of effects that tests of their own have shown, such as hum, are not in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from piezo_ident.diagnosis.criteria import TAKES
+
+#: name of the last weight
+NOTHING = 'none of these'
+#: prior of none, and ratio of the priors of sets with one effect more (taste: nothing known)
+NONE, FURTHER = 0.5, 0.25
+#: number of parts that stand for kinds of motion where the record has none
+PARTS = 5
+
+
+def weights_of(errors: Mapping[tuple[str, ...], float], kinds: int) -> dict[str, float]:
+    """
+    Compute the weight of each set of effects and of none, the largest first; their sum is one.
+
+    Parameters
+    ----------
+    errors : mapping of tuple of str to float
+        Rms error that the best candidate of each set leaves; the empty set has no effect.
+    kinds : int
+        Number of kinds of motion that were held out; 0 if parts of the data replaced them.
+
+    Examples
+    --------
+    >>> weights_of({(): 1.0, ('creep',): 0.1, ('backlash',): 0.9}, 8)
+    {'creep': 1.0, 'none of these': 0.0, 'backlash': 0.0}
+    """
+    sizes = [len(s) for s in errors if s]
+    whole = sum(FURTHER**n for n in set(sizes)) or 1.0
+    logs = {}
+    for effects, error in errors.items():
+        n, square = len(effects), max(error**2, np.finfo(float).tiny)
+        prior = (1.0 - NONE) * FURTHER**n / whole / sizes.count(n) if n else NONE
+        power = -0.5 * (kinds or PARTS)
+        logs['+'.join(effects) or NOTHING] = np.log(prior) + power * np.log(
+            square if n else TAKES * square
+        )
+    most = max(logs.values(), default=0.0)
+    found = {name: float(np.exp(x - most)) for name, x in logs.items()}
+    total = sum(found.values())
+    return {k: x / total for k, x in sorted(found.items(), key=lambda item: -item[1])}

@@ -1,0 +1,107 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Quantities of an identified model, with the deviations of all parameters together."""
+
+from dataclasses import replace
+import functools
+
+import numpy as np
+from paper_stage import STAGE
+from piezo_ident import report
+from piezo_ident.excitation.program import parse_program
+from piezo_ident.fitting.jackknife import deviations, SHARE
+from piezo_ident.identification.identify import identify
+from piezo_ident.identification.results import Settings
+from piezo_ident.model.files import model_from_dict, model_to_dict
+from piezo_ident.model.front_door import ModelParameter
+from piezo_ident.uncertainty.linearised import linearised
+from piezo_ident.uncertainty.parameters import quantities_of, with_deviations
+import pytest
+
+PROGRAM = """
+limits: [0, 10]
+rest: 0
+slew: 200
+segments:
+  - {signal: idle, duration: 0.1}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 6}
+  - {signal: noise, bias: 5, amplitude: 0.4, cutoff: 3000, duration: 0.5}
+  - {signal: triangle, slope: 60}
+"""
+
+
+@functools.cache
+def identified():
+    record = STAGE.play(parse_program(PROGRAM))
+    return identify(record, Settings(order=(10, 10), thresholds=10))
+
+
+def test_replicates_of_a_mean_give_its_deviation():
+    x = np.random.default_rng(1).standard_normal((40, 3))
+    whole = x.mean(axis=0)
+    without = (40 * whole - x) / 39
+    found = deviations(whole + SHARE * (without - whole), whole)
+    np.testing.assert_allclose(found, x.std(axis=0, ddof=1) / np.sqrt(40))
+    assert np.isinf(deviations(x[:1], whole)).all()
+
+
+def test_the_deviations_are_about_as_large_as_the_errors():
+    result = with_deviations(identified())
+    rows = result.model.quantities
+    truth = quantities_of(STAGE.model, result)
+    assert [p.name for p in truth] == [p.name for p in rows]
+    off = {p.name: abs(p.value - q.value) / p.std for p, q in zip(rows, truth, strict=True)}
+    loops = [x for name, x in off.items() if 'loop width' in name]
+    assert len(loops) == 3 and max(loops) < 3.0
+    # G is fitted in steps, which scatter more than one fit of all parameters would
+    gains = [x for name, x in off.items() if name.startswith('gain at')]
+    assert len(gains) == 10 and np.median(gains) < 6.0
+    names = ' '.join(p.name for p in rows)
+    for name in ('static gain', 'loop width at 25%', 'gain at', 'phase at', 'damping of mode 1'):
+        assert name in names
+
+
+def test_deviations_are_in_the_parameters_the_file_the_json_and_the_summary():
+    result = with_deviations(identified())
+    model = model_from_dict(model_to_dict(result.model))
+    assert (
+        model.quantities == result.model.quantities == result.parameters[-len(model.quantities) :]
+    )
+    assert model.quantities[0].name in model.summary()
+    told = report.to_json(result)['quantities']
+    assert told[0]['std'] == model.quantities[0].std and told[0]['known']
+    own = [p for p in model.parameters if p.part == 'G' and p.name.startswith('a_')]
+    assert all(p.std > 0.0 for p in own)
+
+
+def test_a_parameter_that_the_data_do_not_know_says_so():
+    values = [ModelParameter('G', 'x', 1.0, '', std) for std in (0.5, 2.0, float('inf'), None)]
+    assert [p.is_known for p in values] == [True, False, False, None]
+    row = {'part': 'G', 'name': 'gain at 9 kHz', 'value': 1.0, 'unit': '', 'std': float('inf')}
+    model = replace(STAGE.model, identification={'quantities': [row]})
+    assert 'not known' in model.summary()
+    broken = replace(STAGE.model, identification={'quantities': [{'part': 'G'}, 3]})
+    assert broken.quantities == ()
+
+
+def test_what_no_linear_fit_describes_keeps_the_deviations_of_its_steps():
+    result = identified()
+    assert linearised(replace(result, judged=None)) is None
+    assert linearised(replace(result, memories={('r', 0.0): None})) is None
+    swarm = replace(result, hysteresis=replace(result.hysteresis, solver='swarm'))
+    assert with_deviations(swarm) is swarm
+
+
+@pytest.mark.parametrize('factor', [3.0])
+def test_more_noise_makes_larger_deviations(factor):
+    sensor = replace(STAGE.sensor, noise_rms=factor * 10 * STAGE.sensor.noise_rms)
+    record = replace(STAGE, sensor=sensor).play(parse_program(PROGRAM))
+    noisy = with_deviations(identify(record, Settings(order=(10, 10), thresholds=10)))
+    quiet = with_deviations(identified())
+    ratios = [
+        a.std / b.std
+        for a, b in zip(noisy.model.quantities, quiet.model.quantities, strict=False)
+        if a.name == b.name and np.isfinite(a.std)
+    ]
+    assert np.median(ratios) > factor

@@ -1,0 +1,82 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Promises: what another record of the same motion, and of other motion, will show."""
+
+import functools
+
+import numpy as np
+from paper_stage import FS, PAPER
+from piezo_ident import report
+from piezo_ident.diagnosis.results import DiagnosisSettings
+from piezo_ident.identification.results import Settings
+from piezo_ident.record.record import Record
+from piezo_ident.uncertainty.band import KEY
+from piezo_ident.verbs.learn import diagnose, identify
+import pytest
+
+N = 24_000
+
+
+def motion():
+    t = np.arange(N) / FS
+    slow, fast = 2.5 * (1 - np.cos(2 * np.pi * 5 * t)), 0.8 * np.sin(2 * np.pi * 130 * t)
+    return slow * (1.0 + np.floor(4 * t) % 2) + np.where(t > 0.4, fast, 0.0) * (t < 1.0)
+
+
+def record(hum, phase=0.0, seed=0):
+    t, v = np.arange(N) / FS, np.clip(motion(), 0.0, 10.0)
+    noise = 2e-9 * np.random.default_rng(seed).standard_normal(N)
+    y = PAPER.simulate(v) + noise + hum * np.sin(2 * np.pi * 50.0 * t + phase)
+    return Record.from_arrays(v, y, sample_rate=FS, name=f'record {seed}')
+
+
+@functools.cache
+def diagnosis(hum):
+    few = DiagnosisSettings(effects=('periodic_disturbance', 'backlash'))
+    return diagnose(PAPER, record(hum), few)
+
+
+def test_hum_that_was_found_is_promised_to_the_next_record():
+    hum = 2e-7
+    result = diagnosis(hum)
+    assert [e.name for e in result.effects] == ['periodic_disturbance']
+    other = result.model.score(record(hum, 1.0, seed=1)).percent
+    assert result.after.overall < 0.1 * other
+    assert 0.8 < other / result.promise.same < 1.25
+    assert result.promise.told in result.sentence
+
+
+def test_nothing_missing_promises_the_noise():
+    result = diagnosis(0.0)
+    other = result.model.score(record(0.0, seed=1)).percent
+    assert 0.8 < other / result.promise.same < 1.25
+    assert set(result.model.identification[KEY]) == {'coefficients', 'kinds', 'ratio', 'speed'}
+
+
+def test_promise_and_weights_are_in_the_json_and_the_page():
+    result = diagnosis(2e-7)
+    data = report.to_json(result)
+    assert data['schema_version'] == 2
+    assert data['promise']['same_motion'] == result.promise.same
+    assert sum(data['weights'].values()) == pytest.approx(1.0)
+    assert 'none of these' in report.to_json(diagnosis(0.0))['weights']
+    text = ' '.join(report.diagnosis_text(result).split())
+    assert result.promise.told in text and '█' in text
+
+
+def test_an_identification_promises_what_the_next_record_shows():
+    t = np.arange(6000) / 2000.0
+    v = 5.0 - 5.0 * np.cos(2 * np.pi * (1.0 + t) * t)
+    rng = np.random.default_rng(3)
+
+    def measured(name):
+        y = 1e-6 * v + 1e-7 * np.abs(np.sin(v)) + 3e-9 * rng.standard_normal(v.size)
+        return Record.from_arrays(v, y, sample_rate=2000.0, name=name)
+
+    result = identify(measured('one'), Settings(thresholds=6, order=(2, 2), delay=0))
+    assert result.judged is None
+    other = result.model.score(measured('two')).percent
+    assert 0.7 < other / result.promise.same < 1.3
+    assert result.promise.told in ' '.join(report.identification_text(result).split())
+    assert report.to_json(result)['promise']['other_motion'] == result.promise.other
