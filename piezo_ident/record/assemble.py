@@ -148,8 +148,9 @@ def _table(
 
 def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> OrderedRows:
     """Drop rows without a number; a row that lacks y alone stays, with NaN."""
-    others = (x for key, x in table.columns.items() if key != 'y')
-    finite = np.logical_and.reduce([np.isfinite(x) for x in (table.t, *others)])
+    finite = np.isfinite(table.t)
+    for x in (x for key, x in table.columns.items() if key != 'y'):
+        finite &= np.isfinite(x)
     y = table.columns.get('y', table.t)
     unmeasured = finite & ~np.isfinite(y)
     bad = finite.size - int(np.count_nonzero(finite))

@@ -134,7 +134,8 @@ def time_problem(t: Array) -> str:
     low, high = (float(step.min()), float(step.max())) if step.size else (1.0, 1.0)
     if 0.999 * SHORTEST < low and high < UNEVEN * low:
         return ''
-    return f'its time stamps are not ticks of one rate: steps of {low:.6g} to {high:.6g} s'
+    steps = f'steps of {low:.6g} to {high:.6g} s'
+    return f'its time stamps are not ticks of one rate in a row: {steps}'
 
 
 @np.errstate(over='ignore', invalid='ignore')

@@ -180,7 +180,7 @@ def _second(day: str, clock: str) -> int:
 def _whole_rows(lines: Iterator[str]) -> list[str]:
     """Return the next lines, up to the end of a quoted cell; csv.Error without that end."""
     chunk = list(itertools.islice(lines, ROWS))
-    quotes = sum(line.count('"') for line in chunk)
+    quotes = ''.join(chunk).count('"')
     while quotes % 2:
         line = next(lines, '')
         if not line:
