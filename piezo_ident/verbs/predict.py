@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import overload
 
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import expect
+from piezo_ident.common.errors import DataError, expect
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.free_run import predict as predict_axis
@@ -16,6 +17,7 @@ from piezo_ident.model.initial_memory import unknown_starts
 from piezo_ident.model.multi_axis import (
     axis_record,
     EachAxis,
+    is_measured,
     MultiAxisModel,
 )
 from piezo_ident.model.stage_model import StageModel
@@ -28,11 +30,13 @@ def free_run(model: StageModel, record: Record) -> FreeRun: ...
 
 @overload
 def free_run(
-    model: StageModel | MultiAxisModel, record: Record
+    model: StageModel | MultiAxisModel, record: Record, axes: Collection[str] = ...
 ) -> FreeRun | EachAxis[FreeRun]: ...
 
 
-def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | EachAxis[FreeRun]:
+def free_run(
+    model: StageModel | MultiAxisModel, record: Record, axes: Collection[str] = ()
+) -> FreeRun | EachAxis[FreeRun]:
     """
     Predict a record in free run, and compare it with the measured displacement.
 
@@ -45,6 +49,8 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
     model : StageModel or MultiAxisModel
     record : Record
         Its displacement serves only for this estimate and for the errors.
+    axes : collection of str, optional
+        Axes of a model of several that are compared.  Default: all.
 
     Returns
     -------
@@ -73,7 +79,13 @@ def free_run(model: StageModel | MultiAxisModel, record: Record) -> FreeRun | Ea
         return run_axis(model, record)
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     seen = model.seen(record)
-    return EachAxis({axis: run_axis(x, seen[axis]) for axis, x in model.axes.items()})
+    unknown = [a for a in axes or model.axes if a not in seen or not is_measured(record, a)]
+    if unknown:
+        raise DataError(
+            f'{record.name}: has no displacement of {", ".join(unknown)} to compare with; name '
+            "the other axes in 'axes', or predict from the voltages alone"
+        )
+    return EachAxis({axis: run_axis(model.axes[axis], seen[axis]) for axis in axes or model.axes})
 
 
 def predict(
