@@ -16,7 +16,7 @@ the error stops falling.  A further call goes on from the best repetition.
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
 axes do to one another.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
 axes at the same t.  An axis without a reference stays at rest.  Such a stage is not learnt or
-followed, and takes another model at rest only.
+followed.  Another model waits until the next ``~/start``.
 
 With `follow` an observer finds offset, creep of earlier motion, and gain in the displacement, and
 the node corrects the voltage by them.
@@ -83,6 +83,7 @@ class FeedforwardNode(DrivingNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._model: Model | None = None
+        self._later: tuple[Prepared, str] | None = None
         self._source, self._models, self._segment = '', 0, ''
         self._wanted = Reference(self._tails, self._rate_of_clock)
         self._learner: Learner | None = None
@@ -136,8 +137,7 @@ class FeedforwardNode(DrivingNode):
             self._loader.load_file(path)
         if 'window' in changed:
             self._errors.set_window(changed['window'])
-        model = self._model
-        if model is not None and set(changed) & set(LIMITS):
+        if (model := self._model) is not None and set(changed) & set(LIMITS):
             self._tracker = None
             self._loader.load(self._source, lambda: model)
 
@@ -149,7 +149,8 @@ class FeedforwardNode(DrivingNode):
 
     def _take_model(self, loaded: Prepared | None, source: str) -> None:
         if loaded is not None and self._tails[1:] and self._state in DRIVING:
-            loaded, source = None, f'{source}: call ~/stop first, then send the model again'
+            self._later = loaded, source
+            return
         if loaded is None:
             kept = 'the old model is kept' if self._tracker else 'there is no model'
             self._refusal = f'model refused, {kept}: {source}'
@@ -168,9 +169,8 @@ class FeedforwardNode(DrivingNode):
     # services
 
     def _start(self) -> str:
-        tracker = self._begin()
+        delay = self._begin().preview / self._rate_of_clock
         self._learner = None
-        delay = tracker.preview / self._rate_of_clock
         return f'the stage follows the reference {delay:.4g} s later'
 
     def _learn(self) -> str:
@@ -181,9 +181,7 @@ class FeedforwardNode(DrivingNode):
         if kept is None or not isinstance(model, StageModel):
             raise ConfigError('there is no reference to repeat: call ~/start, and send one')
         if self._wanted.length > self.values['longest'] * self._rate_of_clock:
-            raise ConfigError(
-                'the last reference is longer than what is kept of it; raise the parameter longest'
-            )
+            raise ConfigError('the last reference is longer than is kept; raise longest')
         self._begin()
         x, before = kept[0], self._learned
 
@@ -199,6 +197,9 @@ class FeedforwardNode(DrivingNode):
         """Take the right to drive."""
         if self._state in DRIVING:
             raise ConfigError(f'the node drives already: {NOW[self._state]}; call ~/stop first')
+        if self._later is not None:
+            later, self._later = self._later, None
+            self._take_model(*later)
         if self._tracker is None:
             reason = self._refusal or 'publish one on the topic model, or set the parameter model'
             raise ConfigError(f'there is no model: {reason}')
@@ -255,11 +256,10 @@ class FeedforwardNode(DrivingNode):
         if not verdict.is_taken:
             self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
-        is_new = verdict.kind is Kind.START
+        is_new, self._last = verdict.kind is Kind.START, time.monotonic()
         x, faults = self._wanted.take(samples, verdict, resting, self.values['longest'])
         for fault in faults:
             self._faults.note(*fault)
-        self._last = time.monotonic()
         if is_new:
             self._answered = self._last
         if (tracker := self._tracker) is not None:

@@ -7,6 +7,7 @@ import json
 
 from graph import Graph
 import numpy as np
+from observer import LIMIT
 import piezo_ident as pi
 from piezo_ident.record.blocks import Samples
 from programs import identification_program
@@ -15,7 +16,7 @@ import pytest
 RATE = 2000.0
 #: what every axis plays alone
 PROGRAM = identification_program(
-    rate=RATE, slew=400, steps=8, cycles=8, frequency=20, cutoff=800, slope=40
+    rate=RATE, slew=400, steps=8, cycles=8, frequency=20, cutoff=800, noise=1, slope=40
 )
 #: what all axes play at once, each its own
 BOTH = """
@@ -26,6 +27,8 @@ segments:
 """
 TOPICS = ['voltage_b', 'displacement_b']
 AXES = {'axes': ['b']}
+#: as little work as shows two axes
+QUICK = {'thresholds': 4, 'max_order': 2, 'nice': 0}
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +38,7 @@ def lab():
         g.texts('report')
         g.start_all(
             ('stage', {'stage': 'two_axes', 'seed': 3, 'silence': 2.0}),
-            ('identifier', {**AXES, 'program': PROGRAM, 'thresholds': 6, 'max_order': 6}),
+            ('identifier', {**AXES, **QUICK, 'program': PROGRAM}),
             ('model', AXES),
             (
                 'excitation',
@@ -60,7 +63,8 @@ def identified(lab, tmp_path_factory):
     assert lab.call('recorder/start')[0]
     lab.until('recorder', 'recording')
     assert lab.set('excitation', 'in_turn', True)[0]
-    end = lab.finish('identifier/run')
+    # two axes are as much work as two runs
+    end = lab.finish('identifier/run', timeout=2 * LIMIT)
     assert end['state'] == 'done', end['text']
     assert lab.set('excitation', 'in_turn', False)[0]
     lab.finish('recorder/stop')
@@ -150,6 +154,11 @@ def test_both_axes_follow_their_references(lab, identified):
     lab.wait(lambda: 'tracking_percent_b' in lab.status('feedforward'), 'its figure')
     # as roughly as the chains fit this stage
     assert float(lab.status('feedforward')['tracking_percent_b']) < 25.0
+    # the model of the topic, which came while it drove or before, is not lost
+    seen = int(lab.status('feedforward')['models'])
+    assert seen in (1, 2)
+    assert lab.call('feedforward/start')[0]
+    lab.wait(lambda: lab.status('feedforward')['models'] == '2', 'the model of the topic')
     lab.handle('feedforward').stop()
     for topic in ('reference', 'reference_b'):
         lab.unpublish(topic)
