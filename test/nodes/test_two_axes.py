@@ -166,6 +166,7 @@ def test_both_axes_follow_their_references(lab, identified):
 
 def test_a_stop_ramps_both_axes(lab):
     applied = [lab.collect(topic) for topic in ('applied_voltage', 'applied_voltage_b')]
+    assert lab.set('excitation', 'program', BOTH.replace('periods: 2', 'periods: 80'))[0]
     seen = len(lab.statuses('excitation'))
     assert lab.call('excitation/start')[0]
     lab.until('excitation', 'running', since=seen)
