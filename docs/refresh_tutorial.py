@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs/tutorial.md'
 NOTEBOOK = ROOT / 'examples/tutorial.ipynb'
 DATA = ROOT / 'examples/tutorial_data.zip'
+#: the records of two axes
+SCANNER = ROOT / 'examples/tutorial_xy.zip'
 
 GALLERY = ROOT / 'docs/gallery.md'
 IN_GALLERY = re.compile(r'\]\(images/(report|diagnosis)_(\w+\.png)\)')
@@ -130,7 +132,8 @@ def main() -> None:
     before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        Path(DATA.name).symlink_to(DATA)
+        for archive in (DATA, SCANNER):
+            Path(archive.name).symlink_to(archive)
         names: dict[str, Any] = {}
         text = _refreshed(text, names)
         _draw_gallery(names['identification'])

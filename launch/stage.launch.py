@@ -33,7 +33,7 @@ ARGUMENTS = (
         ['true', 'false'],
         'false: a driver of your own publishes displacement and applied_voltage',
     ),
-    ('stage', '', None, 'the stage to simulate: paper, dense, effects, or a file'),
+    ('stage', '', None, 'the stage to simulate: paper, dense, effects, two_axes, or a file'),
     (
         'program',
         '',
@@ -46,6 +46,7 @@ ARGUMENTS = (
         None,
         'a program in micrometres that the stage is to follow, instead of an identification',
     ),
+    ('axes', '', None, 'names of further axes, with commas: b; they play the program in turn'),
     ('model', '', None, 'model file for the live model, and for the feedforward node'),
     ('rate_factor', '', None, 'how many times faster than real time: 0.1 .. 4'),
     ('sample_rate', '', None, 'of excitation and recording [Hz]; that of your driver'),
@@ -86,24 +87,27 @@ def nodes(context):
         name: float(given[name]) if given[name] else None
         for name in ('rate_factor', 'sample_rate')
     }
-    found = [node('model', model=given['model'])]
+    axes = [name.strip() for name in given['axes'].split(',') if name.strip()] or None
+    found = [node('model', model=given['model'], axes=axes)]
     if given['reference']:
         # the limits of the program hold, in micrometres too
         reference = {'quantity': 'reference', 'voltage_high': 1000.0, 'ramp_slew': 500.0}
         found += [
-            node('excitation', program=given['reference'], **reference, **rates),
-            node('feedforward', model=given['model'], sample_rate=rates['sample_rate']),
+            node('excitation', program=given['reference'], axes=axes, **reference, **rates),
+            node('feedforward', model=given['model'], axes=axes, sample_rate=rates['sample_rate']),
         ]
     else:
         found += [
-            node('excitation', program=given['program'], **rates),
-            node('identifier', program=given['program'], output=given['output']),
+            node(
+                'excitation', program=given['program'], axes=axes, in_turn=axes and True, **rates
+            ),
+            node('identifier', program=given['program'], axes=axes, output=given['output']),
         ]
     if given['use_simulated_stage'] == 'true':
         found.append(node('stage', stage=given['stage']))
     if given['record'] == 'true':
-        rate = rates['sample_rate']
-        found.append(node('recorder', output=given['bag'], sample_rate=rate, autostart=True))
+        values = {'output': given['bag'], 'sample_rate': rates['sample_rate'], 'axes': axes}
+        found.append(node('recorder', autostart=True, **values))
     return found
 
 

@@ -21,8 +21,6 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from piezo_ident import effects, report
-    from piezo_ident.axes.from_records import identify_axes
-    from piezo_ident.axes.model_text import AxesModel
     from piezo_ident.common.errors import (
         Cancelled,
         ConfigError,
@@ -58,7 +56,6 @@ __version__ = '0.1.0'
 # public name: where it is defined
 _HOMES = {
     'Axes': 'record.channels',
-    'AxesModel': 'axes.model_text',
     'Cancelled': 'common.errors',
     'ConfigError': 'common.errors',
     'DataError': 'common.errors',
@@ -89,7 +86,6 @@ _HOMES = {
     'export_fmu': 'export.fmu',
     'free_run': 'verbs.predict',
     'identify': 'verbs.learn',
-    'identify_axes': 'axes.from_records',
     'invert': 'verbs.invert',
     'load': 'model.multi_axis',
     'read': 'record.io',
@@ -100,7 +96,6 @@ _HOMES = {
 
 __all__ = [
     'Axes',
-    'AxesModel',
     'Cancelled',
     'ConfigError',
     'DataError',
@@ -132,7 +127,6 @@ __all__ = [
     'export_fmu',
     'free_run',
     'identify',
-    'identify_axes',
     'invert',
     'load',
     'read',

@@ -25,7 +25,7 @@ from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.multi_axis import EachAxis, load
+from piezo_ident.model.multi_axis import EachAxis, load, models_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis_text, to_json, validated
@@ -55,7 +55,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     ):
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
-    of_axes = {'y': given} if isinstance(given, StageModel) else given.axes
+    of_axes = models_of(given)
     if isinstance(diagnosis, EachAxis):
         diagnosis = diagnosis.mapped(lambda axis, x: _named(x, of_axes[axis], records))
     else:

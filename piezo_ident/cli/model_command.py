@@ -28,7 +28,14 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
 from piezo_ident.model.free_run import FreeRun
-from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel, voltage_of
+from piezo_ident.model.multi_axis import (
+    EachAxis,
+    is_measured,
+    load,
+    models_of,
+    MultiAxisModel,
+    voltage_of,
+)
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.io import write_columns
@@ -73,9 +80,12 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     data: dict[str, Any] = {'model': str(args.model)}
     # values that replace faulty readings are not written as readings
     columns: dict[str, Sequence[Array]] = {}
-    if record.is_measured:
+    known = [axis for axis in models_of(model) if is_measured(record, axis)]
+    pieces: dict[str, Sequence[Array]] = {}
+    halves: dict[str, Sequence[Array]] = {}
+    if known:
         with naming(str(args.model)):
-            run = free_run(model, record, args.interval)
+            run = free_run(model, record, args.interval, known)
         console.say(str(run))
         data |= to_json(run)
         runs = {**run} if isinstance(run, EachAxis) else {'y': run}
@@ -91,18 +101,20 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         if args.plot is not None:
             with deferred_interrupts():
                 save_plot(run, args.plot)
-    else:
-        if args.plot is not None:
-            raise ConfigError(
-                f'{record.name}: has no displacement to compare with; leave out --plot'
-            )
+    elif args.plot is not None:
+        raise ConfigError(f'{record.name}: has no displacement to compare with; leave out --plot')
+    if unknown := [axis for axis in models_of(model) if axis not in known]:
         with naming(str(args.model)):
             made = predict(model, record)
-            pieces = {**made} if isinstance(made, EachAxis) else {'y': made}
-            halves = bands(model, record, pieces, args.interval) if args.interval else {}
-        unknown = [text for half in halves.values() for text in unknown_parts(half)]
-        warnings = (*prediction_doubts(model, record), *unknown)
-        console.say(f'{args.model} on {record.name}, which has no displacement: no error is known')
+            of_axes = {**made} if isinstance(made, EachAxis) else {'y': made}
+            others = {axis: of_axes[axis] for axis in unknown}
+            pieces |= others
+            if args.interval:
+                halves |= bands(model, record, others, args.interval)
+        unsure = [text for axis in others for text in unknown_parts(halves.get(axis, ()))]
+        warnings = (*prediction_doubts(model, record), *unsure)
+        lacks = f'displacement of {", ".join(unknown)}' if known else 'displacement'
+        console.say(f'{args.model} on {record.name}, which has no {lacks}: no error is known')
         for warning in warnings:
             console.say(f'  warning: {warning}')
         data['warnings'] = list(warnings)
@@ -111,7 +123,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     if args.out is not None:
         with deferred_interrupts():
             for axis, parts in pieces.items():
-                if axis != 'y':
+                if voltage_of(axis) != 'v':
                     v = voltage_of(axis)
                     columns[v] = [piece.channels[v] for piece in record]
                 columns[f'y_hat{axis[1:]}'] = parts
@@ -165,22 +177,18 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
     options = {'limits': args.limits, 'slew': args.slew or np.inf, 'clip': args.clip}
     drive: Inverse | MultiAxisInverse
     with naming(str(args.record), model=str(args.model)):
+        model = _at_rate(model, piece.sample_rate)
         if isinstance(model, MultiAxisModel):
-            wanted = {
-                'y': piece.y,
-                **{k: x for k, x in piece.channels.items() if k not in further},
-            }
-            drive = invert(model, wanted, channels=further, **options)
+            drive = invert(model, _wanted(model, reference, console), channels=further, **options)
             axes, voltages = {**drive}, {**drive.voltages}
         else:
-            model = replace(model, sample_rate=piece.sample_rate)
             drive = invert(model, piece.y, channels=piece.channels, **options)
             axes, voltages = {'y': drive}, {'v': drive.v}
     console.say(f'{args.model}, told to move as {reference.name}:')
     console.say(str(drive))
     with deferred_interrupts():
         if args.out is not None:
-            n = voltages['v'].size
+            n = next(iter(voltages.values())).size
             columns = {'t': piece.start_time + (np.arange(n) - drive.lead) / piece.sample_rate}
             columns |= voltages
             write_columns(args.out, lambda: iter([columns]))
@@ -191,11 +199,29 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
         {
             'model': str(args.model),
             'reference': str(args.record),
-            **to_json(axes['y']),
+            **to_json(next(iter(axes.values()))),
             'axes': {axis: to_json(x) for axis, x in axes.items()},
             **_wrote(args, console),
         }
     )
+
+
+def _at_rate(model: StageModel | MultiAxisModel, rate: float) -> StageModel | MultiAxisModel:
+    """Give a model the rate of a motion that it takes: a static one holds for any."""
+    if isinstance(model, StageModel):
+        return replace(model, sample_rate=rate)
+    return MultiAxisModel({k: replace(x, sample_rate=rate) for k, x in model.axes.items()})
+
+
+def _wanted(model: MultiAxisModel, reference: Record, console: Console) -> dict[str, Array]:
+    """Return the wanted motion of each axis; one motion alone is that of a single axis."""
+    (piece,) = reference
+    wanted = {'y': piece.y, **{k: x for k, x in piece.channels.items() if role_of(k) == 'y'}}
+    if len(wanted) == len(model.axes) == 1:
+        return dict(zip(model.axes, wanted.values(), strict=True))
+    if left := [axis for axis in wanted if axis not in model.axes]:
+        console.say(f'left out: {", ".join(left)}; the model holds for {", ".join(model.axes)}')
+    return {axis: y for axis, y in wanted.items() if axis in model.axes}
 
 
 def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:

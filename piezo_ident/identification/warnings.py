@@ -77,7 +77,7 @@ def _of_axes(pieces: Sequence[Piece]) -> list[str]:
         return []
     return [
         f'{", ".join(moved)} moved, too: what they do to this axis counts as its error and noise; '
-        'a stage of several axes is identified by identify_axes (docs/two_axes.md)'
+        'record the displacements of these axes, too, and identify all of them (docs/two_axes.md)'
     ]
 
 

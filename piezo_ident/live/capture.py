@@ -11,7 +11,7 @@ not be read, and the time that was dropped to stay within the bounds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import itertools
 
@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.record.blocks import RAMPED, Samples
+from piezo_ident.record.channels import channel_of_quantity
 from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams
-from piezo_ident.record.record import Fault, Record
+from piezo_ident.record.record import Fault, Piece, Record
 from piezo_ident.record.stream import BlockStream
 
 #: kinds of segments that the three steps of the identification need
@@ -74,6 +75,38 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
                 f'{record.name}: {missing[kind]:.3g} s of {whole:.3g} s of the {kind} segments '
                 f'are missing or not usable; {cure}'
             )
+
+
+def refuse_missing(record: Record, axes: Sequence[str]) -> None:
+    """Refuse a record without voltage or displacement of a further axis, with a DataError."""
+    topics = [f'{what}_{axis}' for axis in axes for what in ('voltage', 'displacement')]
+    missing = [
+        topic
+        for topic in topics
+        if any(channel_of_quantity(topic) not in piece.channels for piece in record)
+    ]
+    if missing:
+        raise DataError(
+            f'{record.name}: nothing of {", ".join(missing)} has been captured; does the '
+            "excitation have the same 'axes', and the stage such an axis?"
+        )
+
+
+def records_of_runs(record: Record) -> list[Record]:
+    """
+    Split a record into one record for each run of the sample clock.
+
+    An unknown time passes between two runs, so everything that depends on time starts again.
+    """
+    runs: list[list[Piece]] = []
+    for piece in record:
+        if runs and piece.start_time > runs[-1][-1].start_time:
+            runs[-1].append(piece)
+        else:
+            runs.append([piece])
+    if len(runs) == 1:
+        return [record]
+    return [Record(tuple(pieces), f'{record.name} {i}') for i, pieces in enumerate(runs, 1)]
 
 
 class _Topic:

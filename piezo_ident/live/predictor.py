@@ -10,13 +10,17 @@ the start.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import line_between
 from piezo_ident.common.errors import ModelError
+from piezo_ident.live.axes.run import AxesRun, channels_of, check_axes
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind
+from piezo_ident.model.multi_axis import models_of, MultiAxisModel
 from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -39,6 +43,11 @@ class Predictor:
     """
     Predicts the displacement as blocks of voltage come.
 
+    Parameters
+    ----------
+    axes : sequence of str, optional
+        Names of the displacements; blocks of several axes have a row for each.
+
     Attributes
     ----------
     problem : str
@@ -52,20 +61,20 @@ class Predictor:
         Share of the errors that the band holds.
     """
 
-    def __init__(self, level: float = LEVEL) -> None:
-        self.model: StageModel | None = None
+    def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:
+        self._axes = tuple(axes)
+        self.model: StageModel | MultiAxisModel | None = None
         self.problem = ''
         self.half_width: Samples | None = None
         self._level = level
-        self._band: BandStream | None = None
         self._clock = BlockClock()
         self._clear()
 
     def _clear(self) -> None:
-        self._past = History()
-        self._stream: Stream | None = None
-        self._band = None
-        self._lowest = float('inf')
+        self._pasts = [History() for _ in self._axes]
+        self._run: AxesRun | None = None
+        self._bands = list[BandStream]()
+        self._lowest = [float('inf')] * len(self._axes)
 
     @property
     def lost(self) -> int:
@@ -89,54 +98,62 @@ class Predictor:
 
         The lower end of the voltage range makes it known, until the next gap or new run.
         """
-        return self.model is not None and bool(self.model.scaling.u(self._lowest) < REST)
+        if self.model is None:
+            return False
+        each = models_of(self.model)
+        return all(
+            each[a].scaling.u(v) < REST for a, v in zip(self._axes, self._lowest, strict=True)
+        )
 
     @property
     def memory_lost(self) -> bool:
         """Whether blocks arrive and the memory of the plays is not known."""
         return bool(np.isfinite(self._clock.last)) and not self.memory_known
 
-    def set_model(self, model: StageModel) -> None:
+    def set_model(self, model: StageModel | MultiAxisModel) -> None:
         """
         Take a model, in the state that it would have if it had run from the start.
 
         Raises
         ------
         ModelError
-            When its sampling rate differs from the rate of the stream, or when one of its effects
-            needs a further channel.
+            When its axes or its sampling rate are not those of the stream, or when one of its
+            effects needs a further channel.
         """
-        for setting in model.effects:
-            if setting.channel:
-                raise ModelError(
-                    f'effect {setting.name} needs the further channel {setting.channel!r}, which '
-                    'does not come with the voltage; take the effect out of the model'
-                )
+        check_axes(model, self._axes)
+        for name, channel in channels_of(model):
+            raise ModelError(
+                f'effect {name} needs the further channel {channel!r}, which '
+                'does not come with the voltage; take the effect out of the model'
+            )
         if np.isfinite(self._clock.period):
             self._check_rate(model)
-        if KEY in model.identification:
+        for one in _with_band(model):
             # a damaged band is refused now, not in the stream
-            band_of(model)
+            band_of(one)
         self.model = model
-        self._stream = self.caught_up(model) if self._past else None
-        self._band = None
-        if self._past and self.problem.startswith('the stream'):
+        self._run, self._bands = None, []
+        if self._pasts[0]:
+            self._run = AxesRun(model, self._axes)
+            self._run.recall(self._pasts, self._clock.period)
+        if self._pasts[0] and self.problem.startswith('the stream'):
             self.problem = ''
 
-    def _check_rate(self, model: StageModel) -> None:
-        if model.is_static or abs(self._clock.period * model.sample_rate - 1.0) < 1e-6:
+    def _check_rate(self, model: StageModel | MultiAxisModel) -> None:
+        is_static = all(x.is_static for x in models_of(model).values())
+        if is_static or abs(self._clock.period * model.sample_rate - 1.0) < 1e-6:
             return
         raise ModelError(
             f'the stream is sampled at {1.0 / self._clock.period:.6g} Hz, the model holds for '
             f'{model.sample_rate:g} Hz; identify a model at the rate of the stream'
         )
 
-    def caught_up(self, model: StageModel) -> Stream:
-        """Run a model under the voltage so far; without voltage it is at rest."""
-        stream = model.stream()
-        if not self._past:
+    def caught_up(self, model: StageModel, axis: int = 0) -> Stream:
+        """Run a model under the voltage of an axis so far; without voltage it is at rest."""
+        stream, past = model.stream(), self._pasts[axis]
+        if not past:
             return stream
-        t, v = self._past.recall(stream, model, self._clock.period)
+        t, v = past.recall(stream, model, self._clock.period)
         stream.process(v, t)
         return stream
 
@@ -154,10 +171,10 @@ class Predictor:
         Parameters
         ----------
         samples : Samples
-            Voltage [V].
+            Voltage [V], shape (n,), or (k, n) for k axes; the prediction has the same shape.
         """
         # copies, since the message may change
-        t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64)
+        t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64, ndmin=2)
         if not self._usable(t, v):
             return None
         clock = self._clock
@@ -165,7 +182,7 @@ class Predictor:
         kind, count = clock.judge(t)
         if kind is Kind.LATE:
             self.problem = f'samples at t = {t[0]:.6g} s came again or out of turn'
-            t, v = t[count:], v[count:]
+            t, v = t[count:], np.ascontiguousarray(v[:, count:])
             if not t.size:
                 return None
         elif kind is Kind.START:
@@ -178,11 +195,13 @@ class Predictor:
             self.problem = f'the sampling rate changed at t = {t[0]:.6g} s'
             self._clear()
         elif kind is Kind.GAP:
-            self._bridge(last, float(t[0]), float(v[0]), count)
+            self._bridge(last, float(t[0]), v[:, :1], count)
         y = self._advance(t, v)
         if y is None:
             return None
         half = self._half_width(v, y)
+        if samples.values.ndim < 2:
+            y, half = y[0], None if half is None else half[0]
         self.half_width = (
             None if half is None else Samples(t, half, samples.segment, 'displacement')
         )
@@ -191,12 +210,13 @@ class Predictor:
     def _half_width(
         self, v: NDArray[np.float64], y: NDArray[np.float64]
     ) -> NDArray[np.float64] | None:
-        model = self.model
-        if model is None or KEY not in model.identification:
+        models = [] if self.model is None else _with_band(self.model)
+        if len(models) < len(self._axes):
             return None
-        if self._band is None:
-            self._band = BandStream(model, self._level, plays=self.memory_known, creep=False)
-        return self._band.follow(v, y)
+        if not self._bands:
+            known = self.memory_known
+            self._bands = [BandStream(x, self._level, plays=known, creep=False) for x in models]
+        return np.stack([band.follow(*of) for band, *of in zip(self._bands, v, y, strict=True)])
 
     def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
         if problem := time_problem(t):
@@ -216,14 +236,16 @@ class Predictor:
             return True
         return False
 
-    def _bridge(self, t0: float, t1: float, v1: float, missing: int) -> None:
+    def _bridge(self, t0: float, t1: float, v1: NDArray[np.float64], missing: int) -> None:
         self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'
         if missing * self._clock.period > BRIDGE:
             self._clear()
             return
-        v0 = self._past.last
-        self._advance(line_between(t0, t1, missing), line_between(v0, v1, missing))
-        self._lowest = float('inf')
+        now = [past.last for past in self._pasts]
+        ends = zip(now, v1[:, 0].tolist(), strict=True)
+        between = np.stack([line_between(*end, missing) for end in ends])
+        self._advance(line_between(t0, t1, missing), between)
+        self._lowest = [float('inf')] * len(self._axes)
 
     def _advance(
         self, t: NDArray[np.float64], v: NDArray[np.float64]
@@ -232,18 +254,24 @@ class Predictor:
         model = self.model
         if model is None:
             return None
-        if self._stream is None:
+        if self._run is None:
             try:
                 self._check_rate(model)
             except ModelError as error:
                 self.problem = str(error)
                 return None
-            self._stream = model.stream()
-        return self._stream.process(v, t)
+            self._run = AxesRun(model, self._axes)
+        return self._run.process(v, t)
 
     def _remember(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
-        self._lowest = min(self._lowest, float(v.min()))
-        self._past.add(t, v)
+        for k, past in enumerate(self._pasts):
+            self._lowest[k] = min(self._lowest[k], float(v[k].min()))
+            past.add(t, v[k])
+
+
+def _with_band(model: StageModel | MultiAxisModel) -> list[StageModel]:
+    """List the models of the axes that carry a band."""
+    return [x for x in models_of(model).values() if KEY in x.identification]
 
 
 def warm_up() -> None:

@@ -22,6 +22,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.inputs import FAR
 from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
+from piezo_ident.live.axes.join import held
 from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.history import History
@@ -105,6 +106,8 @@ class Tracker:
     ) -> None:
         self.settings, self.preview, self.follow = settings, preview, follow
         self._inverse = self._built(model)
+        # what other axes move of this axis at rest [m]
+        self.rest_shift = 0.0
         self._lock = threading.Lock()
         self.reset()
 
@@ -112,7 +115,7 @@ class Tracker:
         """Begin at rest, with the clock of the voltage at zero."""
         self._guard, self._past = Guard(self.settings), History()
         self._inverse.reset()
-        start = self._inverse.position
+        start = self._inverse.position + self.rest_shift
         self._raw = self._wanted = np.full(self.preview, start)
         self._join = _Join(start, self._step())
         self.follower = self._new_follower()
@@ -129,6 +132,26 @@ class Tracker:
     def inverse(self) -> LiveInverse:
         """The inverse of the model that is followed."""
         return self._inverse
+
+    @property
+    def passes(self) -> int:
+        """Number of passes of the inverse."""
+        return self._inverse.passes
+
+    @property
+    def expected(self) -> float:
+        """Error that the finite preview leaves [% of stroke]."""
+        return self._inverse.error
+
+    @property
+    def last_reference(self) -> float:
+        """The last sample of the reference [m]."""
+        return float(self._raw[-1])
+
+    @property
+    def rest(self) -> list[float]:
+        """Displacement at rest, as `AxesTracker` lists those of its axes [m]; after `reset`."""
+        return [self.last_reference]
 
     @property
     def tick(self) -> int:
@@ -174,15 +197,23 @@ class Tracker:
         Drive
             As many samples of voltage; each belongs to the reference `preview` samples before.
         """
+        wanted = self.joined(reference, restarted)
+        return self.drive(wanted, self._corrected(wanted))
+
+    def joined(self, reference: ArrayLike, restarted: bool = False) -> Array:
+        """Join the next samples of a reference, as `process` does, to a wanted motion [m]."""
         raw = np.asarray(reference, dtype=np.float64)
         if raw.ndim != 1 or not raw.size:
             raise DataError('a block of a reference is a vector of at least one number')
         if restarted:
             self._join = _Join(self._join.last, self._step())
-        wanted = self._join.process(raw)
         self._raw = np.append(self._raw, raw)[-self.preview :]
+        return self._join.process(raw)
+
+    def drive(self, wanted: Array, goal: Array) -> Drive:
+        """Drive the model along a goal [m], which moves the stage along the wanted motion [m]."""
         self._wanted = np.append(self._wanted, wanted)
-        driven = self._inverse.process(self._corrected(wanted))
+        driven = self._inverse.process(goal)
         v = self._guard.process(driven.v).voltage
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
         return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
@@ -200,7 +231,7 @@ class Tracker:
 
     def finish(self) -> Drive:
         """Make the voltage for the rest of the reference, whose last sample is repeated."""
-        return self.process(np.full(self.preview, self._raw[-1]))
+        return self.process(np.full(self.preview, self.last_reference))
 
     def play(self, v: Array) -> tuple[Array, Array]:
         """Send a given voltage, joined softly and limited; return its time and voltage."""
@@ -270,26 +301,6 @@ class Tracker:
         self._join = _Join(self._inverse.position, self._step(), moves=True)
         self._wanted = self._join.process(self._raw)
         self._inverse.process(self._wanted)
-
-
-def held(x: Array, before: float) -> Array:
-    """
-    Replace each NaN or infinite sample by the sample before it.
-
-    Without a sample before, which is NaN then, the first finite sample of the block replaces it.
-
-    >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
-    [3.0, 1.0, 1.0]
-    >>> held(np.array([np.nan, 1.0, np.inf]), np.nan).tolist()
-    [1.0, 1.0, 1.0]
-    """
-    good = np.isfinite(x)
-    if good.all():
-        return x
-    if good.any() and not math.isfinite(before):
-        before = float(x[np.argmax(good)])
-    last = np.where(good, np.arange(1, x.size + 1), 0)
-    return np.append(before, x)[np.maximum.accumulate(last)]
 
 
 def check_unit(model: StageModel, x: Array) -> None:

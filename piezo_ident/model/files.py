@@ -142,7 +142,9 @@ def check_version(data: Mapping[str, Any], name: str, latest: int = SCHEMA_VERSI
 
 def _check_layout(data: Mapping[str, Any], name: str) -> None:
     """Refuse another schema, missing parts and unknown keys."""
-    if 'several_axes' in data or 'axes' in data:
+    if 'several_axes' in data:
+        raise ModelError(f'{name}: a model of several axes by an earlier version; identify again')
+    if 'axes' in data:
         raise ModelError(f'{name}: a model of several axes; here a model of one axis is needed')
     check_version(data, name)
     missing = [key for key in _REQUIRED if key not in data]

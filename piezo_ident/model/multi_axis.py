@@ -33,6 +33,7 @@ from piezo_ident.model.files import (
     check_version,
     model_from_dict,
     model_to_dict,
+    model_to_yaml,
     yaml_text,
 )
 from piezo_ident.model.free_run import free_run, predict
@@ -84,6 +85,11 @@ def axes_of(records: Sequence[Record]) -> tuple[str, ...]:
         told = '; '.join(f'{name} holds {", ".join(axes)}' for name, *axes in of_each)
         raise DataError(f'{told}; give records of the same axes')
     return next(iter(of_each), ('', 'y'))[1:]
+
+
+def is_measured(record: Record, axis: str) -> bool:
+    """Tell whether a record holds the displacement of an axis."""
+    return all(np.isfinite(_columns(p).get(axis, np.nan)).any() for p in record)
 
 
 def axis_record(
@@ -259,11 +265,11 @@ class MultiAxisModel:
 
     def check_axes(self, columns: Collection[str], name: str) -> None:
         """Refuse data without the voltage of an axis with a DataError."""
-        missing = [axis for axis in self.axes if voltage_of(axis) not in columns]
+        missing = [voltage_of(axis) for axis in self.axes if voltage_of(axis) not in columns]
         if missing:
             raise DataError(
-                f'{name}: has nothing of {", ".join(missing)}; the model holds for '
-                f'{", ".join(self.axes)}'
+                f'{name}: has no voltage {", ".join(missing)}; the model holds for '
+                f'{", ".join(self.axes)}, and each axis needs its voltage'
             )
 
     def motions(self, record: Record) -> dict[str, list[Array]]:
@@ -319,13 +325,32 @@ class MultiAxisModel:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model file; an old file stays whole until the new file is complete."""
-        write_text(path, multi_axis_yaml(self))
+        write_text(path, text_of(self))
 
 
-def multi_axis_yaml(model: MultiAxisModel) -> str:
-    """Return the text of a model file of several axes."""
+def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
+    """List the model of each axis; the one of a `StageModel` is ``y``."""
+    return {'y': model} if isinstance(model, StageModel) else model.axes
+
+
+def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
+    """List the model of each axis without the paths of the others."""
+    if isinstance(model, StageModel):
+        return {'y': model}
+    return {axis: model.own(axis) for axis in model.axes}
+
+
+def text_of(model: StageModel | MultiAxisModel) -> str:
+    """Write a model as the text of its file."""
+    if isinstance(model, StageModel):
+        return model_to_yaml(model)
     of_axes = {axis: model_to_dict(x) for axis, x in model.axes.items()}
     return yaml_text({'schema_version': SCHEMA_VERSION, 'axes': of_axes})
+
+
+def from_dict(data: Mapping[str, Any], name: str) -> StageModel | MultiAxisModel:
+    """Build a model of one axis or of several from the contents of its file."""
+    return (multi_axis_from_dict if 'axes' in data else model_from_dict)(data, name)
 
 
 def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
@@ -366,5 +391,4 @@ def load(path: str | os.PathLike[str]) -> StageModel | MultiAxisModel:
     >>> model.sample_rate, model.hysteresis.thresholds.size
     (20000.0, 9)
     """
-    data = load_yaml(path)
-    return (multi_axis_from_dict if 'axes' in data else model_from_dict)(data, str(path))
+    return from_dict(load_yaml(path), str(path))

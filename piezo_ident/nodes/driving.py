@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.live.axes.tracker import AxesTracker
 from piezo_ident.live.guard import LAST_RAMP
 from piezo_ident.live.pacing import Pace
 from piezo_ident.live.tracker import Tracker
@@ -47,13 +48,15 @@ class DrivingNode(LabNode):
         self._caveats = ''
         super().__init__(**kwargs)
         self._rate_of_clock = self.values['sample_rate']
-        self._tracker: Tracker | None = None
+        self._tracker: Tracker | AxesTracker | None = None
         # the reason for refusing the last model
         self._refusal = ''
         self._faults = RecentFaults()
         self._counts = self._faults.counts
         self._begin_ramp()
-        self._output = ExclusivePublisher(self, 'voltage')
+        # the topic of an axis ends with the tail of the axis
+        self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
+        self._outputs = [ExclusivePublisher(self, f'voltage{tail}') for tail in self._tails]
         self._timer = self.create_timer(PERIOD, self._on_timer, autostart=False)
         self.offer('stop', self._stop)
 
@@ -64,12 +67,13 @@ class DrivingNode(LabNode):
         """Do the due work; return the next state if the right to drive has just come."""
         return ''
 
-    def _take_right(self, tracker: Tracker) -> None:
+    def _take_right(self, tracker: Tracker | AxesTracker) -> None:
         """Ask for the right to drive."""
         tracker.reset()
         self._faults.clear()
         self._caveats = ''
-        self._output.open()
+        for output in self._outputs:
+            output.open()
         self._timer.reset()
         self._go('waiting')
 
@@ -86,12 +90,15 @@ class DrivingNode(LabNode):
     def _on_timer(self) -> None:
         try:
             if self._state == 'waiting':
-                if self._output.poll(self.values['subscribers'], self.values['wait_limit']):
+                limits = self.values['subscribers'], self.values['wait_limit']
+                granted = [output.poll(*limits) for output in self._outputs]
+                if all(granted):
                     self._go(self.work())
             elif self._state == 'stopping':
                 self._ramp()
             else:
-                self._output.refuse_foreign_blocks()
+                for output in self._outputs:
+                    output.refuse_foreign_blocks()
                 self.work()
         except PiezoIdentError as error:
             self._halt('failed', str(error))
@@ -99,8 +106,17 @@ class DrivingNode(LabNode):
     def _send(self, t: NDArray[np.float64], v: NDArray[np.float64], segment: str) -> None:
         for k in range(0, t.size, BLOCK_SIZE * 10):
             cut = slice(k, k + BLOCK_SIZE * 10)
-            self._output.send(Samples(t[cut], v[cut], segment))
+            for tail, output, row in zip(
+                self._tails, self._outputs, np.atleast_2d(v), strict=True
+            ):
+                output.send(Samples(t[cut], row[cut], segment, f'voltage{tail}'))
         self._counts['samples'] += t.size
+
+    def _note_second(self) -> None:
+        """Note who else publishes a voltage."""
+        for tail, output in zip(self._tails, self._outputs, strict=True):
+            if second := output.second() if output.is_open else '':
+                self._faults.note('second', f'second publisher {second} on voltage{tail}', 0)
 
     def _halt(self, state: str, text: str) -> None:
         """Ramp to rest; then report a state with a text."""
@@ -121,12 +137,12 @@ class DrivingNode(LabNode):
         else:
             self.report_state()
 
-    def _send_ramp(self, tracker: Tracker) -> None:
+    def _send_ramp(self, tracker: Tracker | AxesTracker) -> None:
         if (due := self._pace.due()) > 0:
             self._send(*tracker.idle(due), 'ramp:stop')
 
     def _finish(self) -> None:
-        self._output.close()
+        self._close_outputs()
         self._timer.cancel()
         if self._tracker is not None:
             self._tracker.reset()
@@ -144,8 +160,13 @@ class DrivingNode(LabNode):
         if tracker is not None:
             # replaces a slow ramp by a ramp that ends in time
             tracker.hurry()
-        while tracker is not None and self._output.is_open and not tracker.is_at_rest:
+        is_open = any(output.is_open for output in self._outputs)
+        while tracker is not None and is_open and not tracker.is_at_rest:
             self._send(*tracker.idle(size, LAST_RAMP), 'ramp:stop')
             sent += size
             time.sleep(max(0.0, begin + sent / self._rate_of_clock - time.monotonic()))
-        self._output.close()
+        self._close_outputs()
+
+    def _close_outputs(self) -> None:
+        for output in self._outputs:
+            output.close()

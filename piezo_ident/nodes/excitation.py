@@ -12,8 +12,9 @@ faster or slower.  The node waits for no listener; each listener reports its los
 and SIGTERM ramp to rest within a second, if necessary steeper than `ramp_slew`.  A ramp runs in
 real time.
 
-With `axes` the node drives several axes at once, each on its own topic with its own random
-signals: `voltage_b` for axis `b`.  All axes begin, end and stop together.
+With `axes` the node drives several axes, each on its own topic with its own random signals:
+`voltage_b` for axis `b`.  They move at once, or with `in_turn` one after the other.  All axes
+begin, end and stop together.
 
 Two programs at once would tear the stage to and fro.  The node therefore refuses to start beside a
 second publisher on `voltage`, and reports a later one.  The middleware still lists a killed
@@ -44,7 +45,6 @@ from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.exclusive_publisher import ExclusivePublisher
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
 from piezo_ident.record.blocks import cut_blocks, Samples
-from piezo_ident.record.channels import role_of
 
 #: unit of a program, and its factor to the SI unit
 UNITS = {'voltage': ('V', 1.0), 'reference': ('um', 1e-6)}
@@ -132,15 +132,12 @@ class ExcitationNode(LabNode):
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programs that cannot be played, and limits that are crossed."""
-        if name == 'axes':
-            bad = next((x for x in value if x and role_of(f'v_{x}') != 'v'), None)
-            return None if bad is None else f'axes: {bad!r} cannot be the name of an axis'
-        if name not in ('program', 'voltage_low', 'voltage_high', 'rest'):
+        if name not in ('program', 'in_turn', 'voltage_low', 'voltage_high', 'rest'):
             return None
         # not all parameters are declared yet
         if not {'program', 'voltage_low', 'voltage_high', 'rest'} <= self.values.keys():
             return None
-        if name != 'program' and self._is_playing():
+        if name not in ('program', 'in_turn') and self._is_playing():
             return f'{name} cannot be changed while a program is played; call ~/stop first'
         self._guard_settings(self.wanted)
         self._build(self.wanted['program'], self.wanted)
@@ -149,13 +146,14 @@ class ExcitationNode(LabNode):
     def _build(self, text: str, values: Mapping[str, Any] | None = None) -> tuple[Sequence, ...]:
         values = values or self.values
         limits = (values['voltage_low'], values['voltage_high'])
-        key = (text, limits)
+        key = (text, limits, values.get('in_turn'))
         # a file may have changed, so it is read again
         if self._built is None or self._built[0] != key or '\n' not in text:
             try:
                 count = 1 + sum(map(bool, values.get('axes', ())))
                 program = replace(read_program(text), unit=UNITS[self.values['quantity']][0])
-                built = build_axes(program, count, values['sample_rate'], limits)
+                in_turn = values.get('in_turn', False)
+                built = build_axes(program, count, values['sample_rate'], limits, in_turn=in_turn)
             except ConfigError as error:
                 raise self._in_unit(error) from None
             except (OSError, MemoryError) as error:

@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.nodes.journal import Journal, shown
 from piezo_ident.nodes.parameters import Declaration
+from piezo_ident.record.channels import role_of
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -62,6 +63,12 @@ def home_problem(path: str) -> str | None:
     except RuntimeError:
         return f'{path}: there is no such home folder; write the path out'
     return None
+
+
+def axes_problem(names: Sequence[str]) -> str | None:
+    """Return the problem if a text cannot be the name of a further axis, else None."""
+    bad = next((x for x in names if x and role_of(f'v_{x}') != 'v'), None)
+    return None if bad is None else f'axes: {bad!r} cannot be the name of an axis'
 
 
 def no_parameter(node: Node, name: str) -> str:
@@ -166,6 +173,8 @@ class ParameterNode(Node):
             return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
         if isinstance(value, float) and value != value:
             return f'{name} must be a number, got NaN'
+        if name == 'axes' and (problem := axes_problem(value)):
+            return problem
         try:
             return self.refuse(name, value)
         except PiezoIdentError as error:

@@ -9,17 +9,18 @@ from collections.abc import Callable
 from pathlib import Path
 import queue
 import threading
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 from piezo_ident.common.errors import naming, PiezoIdentError
 from piezo_ident.common.files import parse_yaml
-from piezo_ident.model.files import load, model_from_dict
+from piezo_ident.model.multi_axis import from_dict, load, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.wire import LATCHED
 from rclpy.node import Node
 from std_msgs.msg import String
 
 T = TypeVar('T')
+Model: TypeAlias = StageModel | MultiAxisModel
 
 
 def no_file(path: str) -> str | None:
@@ -49,12 +50,12 @@ class ModelLoader(Generic[T]):
     def __init__(
         self,
         node: Node,
-        prepare: Callable[[StageModel], T],
+        prepare: Callable[[Model], T],
         take: Callable[[T | None, str], None],
         done: Callable[[], None],
     ) -> None:
         self._prepare, self._take, self._done = prepare, take, done
-        self._wishes: queue.SimpleQueue[tuple[str, Callable[[], StageModel]]] = queue.SimpleQueue()
+        self._wishes: queue.SimpleQueue[tuple[str, Callable[[], Model]]] = queue.SimpleQueue()
         self._loaded: queue.SimpleQueue[tuple[T | None, str]] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._is_ending = False
@@ -79,7 +80,7 @@ class ModelLoader(Generic[T]):
         """Load a file."""
         self.load(path, lambda: load(path))
 
-    def load(self, source: str, read: Callable[[], StageModel]) -> None:
+    def load(self, source: str, read: Callable[[], Model]) -> None:
         """Load the model that a function returns."""
         self._wishes.put((source, read))
         if self._thread is None:
@@ -92,7 +93,7 @@ class ModelLoader(Generic[T]):
 
     def _load_text(self, message: String) -> None:
         name = 'topic model'
-        self.load(name, lambda: model_from_dict(parse_yaml(message.data, name), name))
+        self.load(name, lambda: from_dict(parse_yaml(message.data, name), name))
 
     def _load_all(self) -> None:
         while True:

@@ -10,6 +10,7 @@ Tests compare the YAML files in ``config/`` with these declarations.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from piezo_ident.live.predictor import LEVEL
@@ -61,6 +62,12 @@ class Declaration:
     read_only: bool = False
 
 
+def with_axes(topics: Sequence[str], axes: Sequence[str]) -> list[str]:
+    """Add the topics of further axes to those of the first axis."""
+    names, kinds = [name for name in axes if name], (*SAMPLE_TOPICS, 'corrections')
+    return [*topics, *(f'{t}_{name}' for name in names for t in topics if t in kinds)]
+
+
 def _rate() -> Declaration:
     return Declaration(
         'sample_rate',
@@ -69,6 +76,15 @@ def _rate() -> Declaration:
         'Hz',
         1.0,
         10e6,
+        read_only=True,
+    )
+
+
+def _axes(what: str) -> Declaration:
+    return Declaration(
+        'axes',
+        ('',),
+        f'names of further axes, {what}; empty names are left out',
         read_only=True,
     )
 
@@ -83,12 +99,9 @@ EXCITATION = (
         choices=('voltage', 'reference'),
         read_only=True,
     ),
+    _axes('each with signals of its own on voltage_<name>'),
     Declaration(
-        'axes',
-        ('',),
-        'names of further axes, each with signals of its own on voltage_<name>; empty names are '
-        'left out',
-        read_only=True,
+        'in_turn', False, 'whether the axes play the program one after the other, not at once'
     ),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
     Declaration(
@@ -169,6 +182,7 @@ IDENTIFIER = (
     Declaration(
         'requests', 2, 'how often one ~/diagnose may ask the excitation for more', '1', 0, 10
     ),
+    _axes('which are identified too, from voltage_<name> and displacement_<name>'),
     Declaration(
         'channels',
         ('',),
@@ -183,6 +197,7 @@ IDENTIFIER = (
 
 MODEL = (
     Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    _axes('which are predicted too, from voltage_<name>'),
     Declaration(
         'warn_ratio',
         3.0,
@@ -250,6 +265,7 @@ RECORDER = (
         'topics to record',
         read_only=True,
     ),
+    _axes('whose topics are recorded too'),
     Declaration(
         'max_bag_size',
         0,
@@ -272,6 +288,7 @@ PLAYER = (
         ('voltage', 'displacement'),
         'topics to replay; a recorded model would overwrite the live one',
     ),
+    _axes('whose topics are replayed too'),
     Declaration('subscribers', 1, 'how many must listen before the first message', '1', 0, 100),
     Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
     Declaration('autostart', False, 'start to replay at once', read_only=True),
@@ -280,6 +297,7 @@ PLAYER = (
 FEEDFORWARD = (
     _rate(),
     Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    _axes('each with a reference_<name> that voltage_<name> follows'),
     Declaration(
         'preview',
         0.02,

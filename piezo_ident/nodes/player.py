@@ -27,6 +27,7 @@ from typing import Any
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
+from piezo_ident.nodes.parameters import with_axes
 from piezo_ident.nodes.subscriptions import message_class, qos_of, topics_problem
 from piezo_ident.nodes.wire import LATCHED, STREAM
 from piezo_ident.record.bags.read import (
@@ -107,7 +108,7 @@ class PlayerNode(LabNode):
             raise PiezoIdentError(f'{bag} does not exist; set the parameter bag')
         if self._is_replaying():
             raise PiezoIdentError('replaying already; call stop, and wait until it has ended')
-        self._replay = Replay(bag, tuple(self.values['topics']))
+        self._replay = Replay(bag, tuple(with_axes(self.values['topics'], self.values['axes'])))
         # a daemon thread: ending it while it searches a large bag loses nothing
         self._thread = threading.Thread(
             target=self._work, args=(self._replay,), name='replay', daemon=True

@@ -28,6 +28,7 @@ from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import Rate
 from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
+from piezo_ident.nodes.parameters import with_axes
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter
 
@@ -98,8 +99,9 @@ class RecorderNode(LabNode):
         if self._is_recording():
             raise PiezoIdentError('recording already; call stop, and wait until it is done')
         recording = Recording(self.values['output'])
-        topics = dict.fromkeys(self.resolve_topic_name(t) for t in self.values['topics'])
-        self._inputs = RawSubscriptions(self, topics)
+        topics = with_axes(self.values['topics'], self.values['axes'])
+        names = dict.fromkeys(self.resolve_topic_name(t) for t in topics)
+        self._inputs = RawSubscriptions(self, names)
         self._recording = recording
         self._thread = threading.Thread(
             target=self._work, args=(recording, self._inputs), name='recording'

@@ -47,7 +47,6 @@ SIGINT and SIGTERM ramp to rest within a second, if necessary steeper than `ramp
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 import functools
 import math
@@ -57,7 +56,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.live.companions import Companion
+from piezo_ident.live.axes.join import Join
 from piezo_ident.live.guard import Applied, Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.pacing import Looks, Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
@@ -116,9 +115,7 @@ class StageNode(LabNode):
             [self.create_publisher(Float64MultiArray, f'{q}{x}', STREAM) for x in self._tails]
             for q in ('displacement', 'applied_voltage')
         )
-        # blocks of the first axis that wait for the other axes, each with its arrival
-        self._waiting: deque[tuple[Samples, int | None, float]] = deque()
-        self._companions = {tail: Companion(self.sample_rate) for tail in self._tails[1:]}
+        self._join = Join(self._tails[1:], self.sample_rate)
         self._further = {
             tail: self.create_subscription(
                 Float64MultiArray,
@@ -126,7 +123,7 @@ class StageNode(LabNode):
                 functools.partial(self._on_further, tail),
                 STREAM,
             )
-            for tail in self._companions
+            for tail in self._tails[1:]
         }
         self._input = self.create_subscription(
             Float64MultiArray, 'voltage', self._on_voltage, STREAM
@@ -189,30 +186,25 @@ class StageNode(LabNode):
             self._sample_clock.skip(sequence)
             self._faults.note('malformed', f'a block is refused: {error}')
         else:
-            self._waiting.append((samples, sequence, time.monotonic()))
+            self._join.add('', samples, time.monotonic(), sequence)
             self._take_complete()
             self._busy += time.perf_counter() - begin
         self._report_state()
 
     def _on_further(self, tail: str, message: Float64MultiArray) -> None:
         try:
-            self._companions[tail].add(from_message(message, f'voltage{tail}'))
+            self._join.add(tail, from_message(message, f'voltage{tail}'), time.monotonic())
         except DataError as error:
             self._faults.note('malformed', f'a block is refused: {error}')
         self._take_complete()
 
     def _take_complete(self) -> None:
         """Process the blocks whose further voltages have come or are overdue."""
-        while self._waiting:
-            samples, sequence, since = self._waiting[0]
-            lacking = any(
-                not companion.has(samples.t) and self._further[tail].get_publisher_count()
-                for tail, companion in self._companions.items()
-            )
-            patience = min(PATIENCE, self.values['silence'] / 2)
-            if lacking and not self._looks.is_over(since, patience):
-                return
-            self._waiting.popleft()
+        patience = min(PATIENCE, self.values['silence'] / 2)
+        silent = [tail for tail, x in self._further.items() if not x.get_publisher_count()]
+        for samples, sequence in self._join.complete(
+            lambda since: self._looks.is_over(since, patience), silent
+        ):
             self._take(samples, sequence)
 
     def _take(self, samples: Samples, sequence: int | None) -> None:
@@ -252,7 +244,7 @@ class StageNode(LabNode):
         """Pass the command of an axis through its guard; return the applied voltage."""
         command = samples.values
         if tail:
-            command = self._companions[tail].take(samples.t)
+            command = self._join.take(tail, samples.t)
             missing = int(np.count_nonzero(np.isnan(command)))
             if missing and (missing < command.size or not guard.is_at_rest):
                 about = f'{missing} samples of voltage{tail} are missing: the last stays in force'
@@ -297,8 +289,7 @@ class StageNode(LabNode):
 
     def _end_stream(self) -> None:
         self._sample_clock.end()
-        for companion in self._companions.values():
-            companion.clear()
+        self._join.clear()
 
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', RAMPED
@@ -352,7 +343,7 @@ class StageNode(LabNode):
                 for tail, guard in zip(self._tails, self._axis_guards, strict=True)
             },
         }
-        if self._companions:
+        if self._further:
             values['missing'] = self._counts['missing']
         if rate:
             values['head_room'] = f'{max(0.0, 1.0 - worked * self.sample_rate / rate):.3f}'

@@ -135,7 +135,7 @@ def _free_run_errors(errors: FreeRunErrors) -> dict[str, Any]:
     }
 
 
-def json_text(result: Identification | Diagnosis, runs: Sequence[PieceRun] = ()) -> str:
+def json_text(result: Shown, runs: Sequence[PieceRun] = ()) -> str:
     """Return `to_json` as text on one line."""
     return json.dumps(to_json(result, runs), ensure_ascii=False, allow_nan=False)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.export.header import export_c as export_axis
 from piezo_ident.export.header import plain_text
 from piezo_ident.export.links import LinkGroup, links_of
@@ -39,7 +40,7 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     DataError
         When `model` is something else, or limits or slew are impossible.
     ConfigError
-        When the name is not allowed in C.
+        When the name is not allowed in C, or two axes have the same names there.
     ModelError
         When an effect of the model has no C code, or the preview is shorter than the delay.
 
@@ -53,6 +54,12 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     if not isinstance(model, MultiAxisModel):
         return export_axis(model, name, **options)
     tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
+    alike = [axis for axis in tags if [*tags.values()].count(tags[axis]) > 1]
+    if alike:
+        raise ConfigError(
+            f'axes {" and ".join(alike)}: differ by case alone, so their C code has the same '
+            'names; rename one of them in the model file'
+        )
     sources = [
         a for a in model.axes if any(motion_of(a) in channels_of(x) for x in model.axes.values())
     ]

@@ -11,6 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.identification.identify import identify as identification_alone
@@ -100,6 +101,8 @@ def identify(
         When the data are not enough for a model; the message names the missing data.
     DataError
         When records hold different axes.
+    ConfigError
+        When there are steps, and records of several axes.
 
     Examples
     --------
@@ -116,6 +119,11 @@ def identify(
         return identify_axis(
             records, settings, validation=validation, progress=progress, steps=steps
         )
+    if steps is not None:
+        raise ConfigError(
+            f'identify: steps are of a stage of one axis, and the records hold {", ".join(axes)}; '
+            'leave the steps out, or give records of one axis'
+        )
     of_axes = {axis: [part for r in records for part in _moved(r, axis)] for axis in axes}
     still = tuple(
         f'{voltage_of(axis)} never moves; axis {axis} is not identified'
@@ -123,9 +131,7 @@ def identify(
         if not parts
     )
     if not any(of_axes[axis] for axis in axes if axis != 'y'):
-        one = identify_axis(
-            records, settings, validation=validation, progress=progress, steps=steps
-        )
+        one = identify_axis(records, settings, validation=validation, progress=progress)
         return replace(one, warnings=(*one.warnings, *still))
     found = {}
     for axis, parts in of_axes.items():

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import overload
 
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import expect
+from piezo_ident.common.errors import DataError, expect
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.free_run import predict as predict_axis
@@ -17,6 +17,7 @@ from piezo_ident.model.initial_memory import unknown_starts
 from piezo_ident.model.multi_axis import (
     axis_record,
     EachAxis,
+    is_measured,
     MultiAxisModel,
 )
 from piezo_ident.model.stage_model import StageModel
@@ -30,12 +31,18 @@ def free_run(model: StageModel, record: Record, interval: float | None = ...) ->
 
 @overload
 def free_run(
-    model: StageModel | MultiAxisModel, record: Record, interval: float | None = ...
+    model: StageModel | MultiAxisModel,
+    record: Record,
+    interval: float | None = ...,
+    axes: Collection[str] = ...,
 ) -> FreeRun | EachAxis[FreeRun]: ...
 
 
 def free_run(
-    model: StageModel | MultiAxisModel, record: Record, interval: float | None = None
+    model: StageModel | MultiAxisModel,
+    record: Record,
+    interval: float | None = None,
+    axes: Collection[str] = (),
 ) -> FreeRun | EachAxis[FreeRun]:
     """
     Predict a record in free run, and compare it with the measured displacement.
@@ -51,6 +58,8 @@ def free_run(
         Its displacement serves only for this estimate and for the errors.
     interval : float, optional
         Level of a band of the error, for example 0.9; see `piezo_ident.uncertainty.band`.
+    axes : collection of str, optional
+        Axes of a model of several that are compared.  Default: all.
 
     Returns
     -------
@@ -81,7 +90,13 @@ def free_run(
         return run if interval is None else with_interval(model, run, interval)
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     seen = model.seen(record)
-    return EachAxis({axis: free_run(x, seen[axis], interval) for axis, x in model.axes.items()})
+    unknown = [a for a in axes or model.axes if a not in seen or not is_measured(record, a)]
+    if unknown:
+        raise DataError(
+            f'{record.name}: has no displacement of {", ".join(unknown)} to compare with; name '
+            "the other axes in 'axes', or predict from the voltages alone"
+        )
+    return EachAxis({a: free_run(model.axes[a], seen[a], interval) for a in axes or model.axes})
 
 
 def predict(

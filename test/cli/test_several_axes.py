@@ -3,12 +3,14 @@
 
 """The verbs of the command line on a stage of two axes."""
 
+from dataclasses import replace
 import json
 
 from axes_scanner import play, raster, scanner, sweeps
-from command_line import refuse, succeed
+from command_line import refuse, run, succeed
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.operators.dynamics import Delay, Dynamics
 import pytest
 
 
@@ -73,3 +75,52 @@ def test_export_writes_a_step_of_all_axes(capsys, folder, tmp_path):
     assert 'stage_step(stage_state *s, const double v[2]' in (tmp_path / 'stage.h').read_text()
     words = ['export', folder / 'stage.yaml', '--out', tmp_path / 'stage.fmu']
     refuse(capsys, tmp_path, words, 'stage.yaml', 'several axes')
+
+
+def test_an_axis_without_displacement_is_predicted_and_the_others_are_compared(
+    capsys, folder, tmp_path
+):
+    raster = dict(np.load(folder / 'raster.npz'))
+    for lacks, has in (('y', 'y_b'), ('y_b', 'y')):
+        np.savez(tmp_path / 'part.npz', **{k: x for k, x in raster.items() if k != lacks})
+        words = ['predict', folder / 'stage.yaml', tmp_path / 'part.npz', '--json']
+        words += ['--out', tmp_path / f'{has}.npz']
+        data = json.loads(succeed(capsys, *words))
+        assert list(data['axes']) == [has]
+        assert data['axes'][has]['whole']['percent_of_stroke'] < 0.02
+        made = np.load(tmp_path / f'{has}.npz')
+        assert np.std(made[f'y_hat{lacks[1:]}'] - raster[lacks]) < 4e-9
+
+
+def test_a_model_of_a_further_axis_alone_is_inverted(capsys, folder, tmp_path):
+    pi.MultiAxisModel({'y_b': scanner().own('y_b')}).save(tmp_path / 'alone.yaml')
+    t = np.arange(1000) / 1000.0
+    y_b = 1e-5 * (1 - 0.8 * np.cos(2 * np.pi * t))
+    for columns in ({'y_b': y_b}, {'y': 2 * y_b, 'y_b': y_b}):
+        np.savez(tmp_path / 'wanted.npz', t=t, **columns)
+        words = [tmp_path / 'wanted.npz', '--out', tmp_path / 'drive.npz', '--overwrite']
+        code, said, _ = run(capsys, 'invert', tmp_path / 'alone.yaml', *words)
+        assert code == 0
+        assert ('left out: y;' in said) == ('y' in columns)
+        drive = np.load(tmp_path / 'drive.npz')
+        assert set(drive) == {'t', 'v_b'}
+        made = scanner().own('y_b').simulate(drive['v_b'])
+        assert np.abs(made[-1000:] - y_b).max() < 1e-8
+
+
+def test_the_slew_of_static_axes_is_at_the_rate_of_the_motion(capsys, folder, tmp_path):
+    still = {
+        axis: replace(x, dynamics=Dynamics(np.empty(0), np.ones(1)), delay=Delay(0), effects=())
+        for axis, x in scanner().axes.items()
+    }
+    assert all(x.is_static for x in still.values())
+    pi.MultiAxisModel(still).save(tmp_path / 'static.yaml')
+    t = np.arange(2000) / 5000.0
+    y = 1e-5 * (1 - 0.8 * np.cos(2 * np.pi * 20 * t))
+    np.savez(tmp_path / 'wanted.npz', t=t, y=y, y_b=y)
+    words = ['invert', tmp_path / 'static.yaml', tmp_path / 'wanted.npz', '--slew', '100']
+    out = tmp_path / 'drive.npz'
+    succeed(capsys, *words, '--clip', '--out', out)
+    for v in (np.load(out)[name] for name in ('v', 'v_b')):
+        # at the 1000 Hz of the model it would be five times as steep
+        assert np.abs(np.diff(v)).max() * 5000.0 == pytest.approx(100.0, rel=1e-6)

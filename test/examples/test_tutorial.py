@@ -5,6 +5,7 @@
 
 import importlib.util
 from pathlib import Path
+import re
 import shlex
 import zipfile
 
@@ -37,11 +38,13 @@ def test_the_notebook_is_the_page(tutorial):
 
 def test_the_data_are_small(tutorial):
     assert tutorial.DATA.stat().st_size < 300_000
+    assert tutorial.SCANNER.stat().st_size < 200_000
 
 
 @pytest.mark.slow
 def test_the_notebook_runs(tutorial, tmp_path):
-    (tmp_path / tutorial.DATA.name).symlink_to(tutorial.DATA)
+    for archive in (tutorial.DATA, tutorial.SCANNER):
+        (tmp_path / archive.name).symlink_to(archive)
     notebook = nbformat.read(tutorial.NOTEBOOK, as_version=4)
     nbclient.NotebookClient(
         notebook, timeout=None, resources={'metadata': {'path': str(tmp_path)}}
@@ -55,6 +58,12 @@ def test_the_notebook_runs(tutorial, tmp_path):
     (printed,) = (o['text'] for o in outputs if ' before, ' in o.get('text', ''))
     before, after = float(printed.split()[0]), float(printed.split()[5])
     assert before > 0.5 and after < 0.1
+    # and of the two axes: each path is found, and the raster is predicted better with it
+    (paths,) = (o['text'] for o in outputs if 'cross_coupling' in o.get('text', ''))
+    assert 'motion_b' in paths.splitlines()[0] and 'motion' in paths.splitlines()[1]
+    rasters = [o['text'] for o in outputs if 'of the raster' in o.get('text', '')]
+    for alone, both in zip(*(re.findall(r'([0-9.]+) %', text) for text in rasters), strict=True):
+        assert float(both) < 0.5 * float(alone) and float(both) < 0.4
 
 
 def test_the_commands_of_the_page_are_understood_and_read_what_is_there(tutorial):

@@ -3,6 +3,8 @@
 
 """Several axes play one program side by side."""
 
+import itertools
+
 import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.axes import build_axes
@@ -49,3 +51,18 @@ def test_all_lines_of_a_multisine():
     assert (lines[1:51] > 0.5 * lines[1]).all() and lines[51:].max() < 1e-9 * lines[1]
     with pytest.raises(ConfigError, match='lines'):
         parse_program(TWO.replace('period: 0.5,', 'lines: even, period: 0.5,'))
+
+
+def test_axes_that_play_in_turn_rest_while_another_one_moves():
+    axes = build_axes(parse_program(TWO), 3, 1000.0, in_turn=True)
+    n = parse_program(TWO).build(1000.0).n
+    moves = np.array([axis.v != 0.0 for axis in axes])
+    assert moves.any(axis=1).all() and not (moves.sum(axis=0) > 1).any()
+    np.testing.assert_array_equal(axes[0].v[:n], parse_program(TWO).build(1000.0).v)
+    assert all(axis.segments == axes[0].segments for axis in axes)
+    assert [s.kind for s in axes[0].segments].count('noise') == 3
+    ends = [(s.start, s.stop) for s in axes[0].segments]
+    assert ends[0][0] == 0 and ends[-1][1] == axes[0].n
+    assert all(one[1] == other[0] for one, other in itertools.pairwise(ends))
+    labels = [s.label for s in axes[0].segments]
+    assert all(one != other for one, other in itertools.pairwise(labels))

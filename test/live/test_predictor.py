@@ -454,4 +454,4 @@ def test_blocks_that_are_kept_are_bounded(monkeypatch):
     predictor = Predictor()
     for b in [block(0, 2), *(block(k, 1) for k in range(2, 200))]:
         predictor.process(b)
-    assert len(predictor._past._recent) == 50
+    assert len(predictor._pasts[0]._recent) == 50

@@ -30,7 +30,6 @@ import sys
 #: bytes of a number of a process or of an exit code
 NUMBER = 8
 MODULES = (
-    'axes.from_records',
     'cli.main',
     'control.learning',
     'control.live_inverse',
@@ -42,6 +41,7 @@ MODULES = (
     'record.bags.recover',
     'record.bags.write',
     'report.folder',
+    'verbs.learn',
 )
 #: largest request: a command and an environment
 REQUEST = 1 << 17

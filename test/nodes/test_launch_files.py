@@ -43,7 +43,10 @@ class ParameterValue(Substitution):
 
 
 def perform(what, context):
-    if isinstance(what, (list, tuple)):
+    if isinstance(what, list):
+        # an array of texts
+        return what
+    if isinstance(what, tuple):
         return ''.join(perform(part, context) for part in what)
     return what.perform(context) if isinstance(what, Substitution) else what
 
@@ -207,6 +210,24 @@ def test_a_stage_follows_a_reference_with_a_model():
     assert started['excitation']['program'] == 'scan'
     assert started['excitation']['quantity'] == 'reference'
     assert started['excitation']['sample_rate'] == started['feedforward']['sample_rate'] == 10e3
+
+
+def test_two_axes_reach_every_node():
+    started = {
+        n: v for (_, n), v in carry_out(file_of('two_axes'), {'record': 'true'}, {}).items()
+    }
+    assert set(started) == {'excitation', 'stage', 'identifier', 'model', 'recorder'}
+    assert started['stage']['stage'] == 'two_axes'
+    for name in ('excitation', 'identifier', 'model', 'recorder'):
+        assert started[name]['axes'] == ['b']
+    assert started['excitation']['in_turn'] is True
+    assert started['excitation']['sample_rate'] == started['recorder']['sample_rate'] == 2000.0
+    # without axes the files say what to do
+    alone = {n: v for (_, n), v in carry_out(file_of('stage'), {}, {}).items()}
+    assert alone['excitation']['axes'] == [''] and alone['excitation']['in_turn'] is False
+    context = {'axes': 'b, c', 'reference': 'scan', 'model': 'm.yaml'}
+    track = {n: v for (_, n), v in carry_out(file_of('stage'), context, {}).items()}
+    assert track['feedforward']['axes'] == track['excitation']['axes'] == ['b', 'c']
 
 
 def test_what_is_not_given_stays_as_the_files_have_it(tmp_path):

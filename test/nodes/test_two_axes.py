@@ -7,40 +7,28 @@ import json
 
 from graph import Graph
 import numpy as np
+from observer import LIMIT
 import piezo_ident as pi
-from piezo_ident.common.errors import ModelError
-from piezo_ident.common.files import parse_yaml
-from piezo_ident.model.files import model_from_dict
 from piezo_ident.record.blocks import Samples
+from programs import identification_program
 import pytest
 
-PROGRAM = """
+RATE = 2000.0
+#: what every axis plays alone
+PROGRAM = identification_program(
+    rate=RATE, slew=400, steps=8, cycles=8, frequency=20, cutoff=800, noise=1, slope=40
+)
+#: what all axes play at once, each its own
+BOTH = """
 limits: [0, 10]
 slew: 400
 segments:
-  - signal: multisine
-    name: small
-    bias: 5
-    amplitude: 1.5
-    lowest: 1
-    highest: 800
-    lines: all
-    period: 0.512
-    periods: 2
-    realisations: 3
-  - signal: multisine
-    name: large
-    bias: 5
-    amplitude: 4
-    lowest: 1
-    highest: 800
-    lines: all
-    period: 0.512
-    periods: 2
-    realisations: 3
+  - {signal: multisine, bias: 5, amplitude: 4, lowest: 1, highest: 100, period: 0.5, periods: 2}
 """
 TOPICS = ['voltage_b', 'displacement_b']
-RATE = 2000.0
+AXES = {'axes': ['b']}
+#: as little work as shows two axes
+QUICK = {'thresholds': 4, 'max_order': 2, 'nice': 0}
 
 
 @pytest.fixture(scope='module')
@@ -50,15 +38,16 @@ def lab():
         g.texts('report')
         g.start_all(
             ('stage', {'stage': 'two_axes', 'seed': 3, 'silence': 2.0}),
-            ('identifier', {'channels': TOPICS, 'program': PROGRAM}),
+            ('identifier', {**AXES, **QUICK, 'program': PROGRAM}),
+            ('model', AXES),
             (
                 'excitation',
                 {
-                    'axes': ['b'],
-                    'program': PROGRAM,
+                    **AXES,
+                    'program': BOTH,
                     'sample_rate': RATE,
                     'rate_factor': 4.0,
-                    'subscribers': 2,
+                    'subscribers': 3,
                 },
             ),
             ('recorder', {'topics': ['voltage', 'displacement', *TOPICS], 'sample_rate': RATE}),
@@ -66,46 +55,122 @@ def lab():
         yield g
 
 
-def test_a_service_call_identifies_both_axes(lab, tmp_path):
-    assert lab.set('recorder', 'output', str(tmp_path / 'bag'))[0]
+@pytest.fixture(scope='module')
+def identified(lab, tmp_path_factory):
+    """Return the end of a run in which the axes move one after the other, and its folder."""
+    folder = tmp_path_factory.mktemp('run')
+    assert lab.set('recorder', 'output', str(folder / 'bag'))[0]
     assert lab.call('recorder/start')[0]
     lab.until('recorder', 'recording')
-    end = lab.finish('identifier/run_axes')
+    assert lab.set('excitation', 'in_turn', True)[0]
+    # two axes are as much work as two runs
+    end = lab.finish('identifier/run', timeout=2 * LIMIT)
     assert end['state'] == 'done', end['text']
-    assert end['effect'] in ('loop_hysteresis', 'hysteretic_stiffness'), end['text']
-    # in free run on the realisations held out
-    assert float(end['error_percent']) < 0.5 * float(end['linear_percent'])
-    assert f'{end["error_percent"]} %' in end['text']
+    assert lab.set('excitation', 'in_turn', False)[0]
+    lab.finish('recorder/stop')
     lab.wait(lambda: lab.texts('model'), 'the model')
-    text = lab.texts('model')[-1]
-    (tmp_path / 'axes_model.yaml').write_text(text)
-    held = pi.AxesModel.load(tmp_path / 'axes_model.yaml')
-    assert (held.inputs, held.outputs) == (('v', 'v_b'), ('y', 'y_b'))
-    assert held.model.radius < 1 and held.error_percent == pytest.approx(
-        float(end['error_percent']), rel=5e-3
-    )
-    report = json.loads(lab.texts('report')[-1])['several_axes']
-    assert {c['name'] for c in report['candidates']} >= {'linear', held.effect}
+    return end, folder
+
+
+def test_a_run_identifies_both_axes(lab, identified):
+    end, folder = identified
+    (folder / 'model.yaml').write_text(lab.texts('model')[-1])
+    model = pi.load(folder / 'model.yaml')
+    assert list(model.axes) == ['y', 'y_b'] and model.sample_rate == RATE
+    report = json.loads(lab.texts('report')[-1])['axes']
+    assert list(report) == ['y', 'y_b']
+    # the loop of this stage is not in front of its mechanics, so the chains fit roughly
+    for tail in ('', '_b'):
+        assert float(end[f'error_percent{tail}']) < 15.0, end['text']
     # the stage did not lose or alter anything
     stage = lab.diagnostics('stage')
     assert (stage['lost'], stage['missing'], stage['altered_too_fast']) == ('0', '0', '0')
-    # a node that takes one axis says so
-    with pytest.raises(ModelError, match='a model of several axes'):
-        model_from_dict(parse_yaml(text, 'model'))
+    inputs = pi.Axes.of(pi.read(folder / 'bag').pieces[0]).inputs
+    # one after the other
+    assert not (np.ptp(inputs, axis=0) == 0.0).any() and (inputs.min(axis=1) == 0.0).all()
 
-    lab.finish('recorder/stop')
-    axes = pi.Axes.of(pi.read(tmp_path / 'bag').pieces[0])
-    assert axes.outputs.shape[1] == 2 and axes.sample_rate == RATE
-    again = pi.TwoAxisStage.load('two_axes').run(np.random.default_rng(3)).process(axes.inputs)
-    np.testing.assert_array_equal(axes.outputs, again)
+    ok, reason = lab.call('identifier/identify_delay')
+    assert not ok and 'one axis' in reason
 
-    assert lab.set('identifier', 'output', str(tmp_path / 'out'))[0]
-    assert lab.finish('identifier/save')['state'] == 'done'
-    assert (tmp_path / 'out' / 'axes_model.yaml').read_text() == lab.texts('model')[-1]
+
+def test_the_live_prediction_is_the_free_run(lab, identified):
+    (identified[1] / 'model.yaml').write_text(lab.texts('model')[-1])
+    model = pi.load(identified[1] / 'model.yaml')
+    lab.wait(lambda: lab.status('model')['state'] == 'predicting', 'a model')
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
+    # of the paths there are none yet; the last figures of a path are of the test of `AxesRun`
+    topics = [f'{what}{tail}' for tail in ('', '_b') for what in ('voltage', 'prediction')]
+    heard = {topic: lab.collect(topic) for topic in (*topics, 'residual_b', 'estimate_b')}
+    assert lab.finish('excitation/start')['state'] == 'done'
+    last = heard['voltage'][-1].t[-1]
+    for topic in topics:
+        lab.wait(lambda topic=topic: heard[topic][-1].t[-1] == last, topic)
+    whole = {k: np.concatenate([x.values for x in heard[k]]) for k in topics}
+    y = model.simulate({'v': whole['voltage'], 'v_b': whole['voltage_b']})
+    for axis, tail in (('y', ''), ('y_b', '_b')):
+        miss = np.abs(whole[f'prediction{tail}'] - y[axis]).max()
+        assert miss < 1e-12 * np.ptp(y[axis])
+    assert not np.array_equal(whole['voltage'], whole['voltage_b'])
+    lab.wait(lambda: heard['residual_b'] and heard['estimate_b'], 'residual and estimate')
+    lab.wait(lambda: 'residual_percent_b' in lab.diagnostics('model'), 'the error of the axis')
+
+
+def test_a_model_of_other_axes_is_refused(lab, identified):
+    alone = identified[1] / 'alone.yaml'
+    pi.load(identified[1] / 'model.yaml').axes['y'].save(alone)
+    assert lab.set('model', 'model', str(alone))[0]
+    lab.wait(lambda: 'y, y_b' in lab.status('model')['text'], 'the refusal')
+    assert 'the old model is kept' in lab.status('model')['text']
+
+
+def test_both_axes_follow_their_references(lab, identified):
+    path = identified[1] / 'model.yaml'
+    spans = {axis: x.scaling for axis, x in pi.load(path).axes.items()}
+    lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), 'slew': 1000.0})
+    ok, said = lab.call('feedforward/learn')
+    assert not ok and 'one axis' in said
+    ok, said = lab.set('feedforward', 'follow', 'offset')
+    assert not ok and 'one axis' in said
+    sent = [lab.collect(topic) for topic in ('voltage', 'voltage_b')]
+    errors, begin = lab.collect('tracking_error_b'), [len(blocks) for blocks in sent]
+    assert lab.call('feedforward/start')[0]
+    lab.until('feedforward', 'ready')
+    t = np.arange(2400) / RATE
+    soft = 0.5 - 0.5 * np.cos(np.pi * np.minimum(t / 0.3, 1.0))
+    for k in range(0, t.size, 100):
+        cut = slice(k, k + 100)
+        for tail, f in (('', 5.0), ('_b', 2.0)):
+            s = spans[f'y{tail}']
+            x = s.y0 + s.Y * soft[cut] * (0.4 - 0.2 * np.cos(2 * np.pi * f * t[cut]))
+            lab.publish(f'reference{tail}', Samples(t[cut], x, 'scan', f'reference{tail}'))
+    lab.until('feedforward', 'done')
+    told = lab.status('feedforward')['text']
+    assert 'refused' not in told and 'missing' not in told, told
+    first, second = (
+        np.concatenate([block.values for block in blocks[start:]])
+        for blocks, start in zip(sent, begin, strict=True)
+    )
+    assert first[-1] == second[-1] == 0.0
+    for v in (first, second):
+        assert 2.0 < np.ptp(v) and v.min() >= 0.0 and v.max() <= 10.0
+        assert np.abs(np.diff(v)).max() * RATE <= 1000.0 * (1 + 1e-9)
+    lab.wait(lambda: errors, 'the tracking error')
+    lab.wait(lambda: 'tracking_percent_b' in lab.status('feedforward'), 'its figure')
+    # as roughly as the chains fit this stage
+    assert float(lab.status('feedforward')['tracking_percent_b']) < 25.0
+    # the model of the topic, which came while it drove or before, is not lost
+    seen = int(lab.status('feedforward')['models'])
+    assert seen in (1, 2)
+    assert lab.call('feedforward/start')[0]
+    lab.wait(lambda: lab.status('feedforward')['models'] == '2', 'the model of the topic')
+    lab.handle('feedforward').stop()
+    for topic in ('reference', 'reference_b'):
+        lab.unpublish(topic)
 
 
 def test_a_stop_ramps_both_axes(lab):
     applied = [lab.collect(topic) for topic in ('applied_voltage', 'applied_voltage_b')]
+    assert lab.set('excitation', 'program', BOTH.replace('periods: 2', 'periods: 80'))[0]
     seen = len(lab.statuses('excitation'))
     assert lab.call('excitation/start')[0]
     lab.until('excitation', 'running', since=seen)

@@ -10,6 +10,7 @@ from axes_scanner import chain, CROSS, path, play, raster, scanner, sweeps
 from c_compiler import COMPILER, needs_compiler, STRICT
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.identification.results import Steps
 from piezo_ident.model.multi_axis import axis_record, MultiAxisModel
 import pytest
 
@@ -159,8 +160,34 @@ def test_axes_that_do_not_belong_together_are_refused():
         MultiAxisModel({'y': one, 'y_b': replace(one, sample_rate=2000.0)})
     with pytest.raises(pi.ModelError, match='motion_c'):
         MultiAxisModel({'y': path(one, 'motion_c', 0.01), 'y_b': one})
-    with pytest.raises(pi.DataError, match='y_b'):
-        pi.free_run(scanner(), pi.Record.from_arrays(*np.zeros((2, 100)), sample_rate=1000.0))
+
+
+@pytest.mark.parametrize(('lacks', 'names'), [('v_b', 'no voltage v_b'), ('y_b', 'of y_b')])
+def test_a_record_that_lacks_a_column_is_refused_by_its_name(lacks, names):
+    v = np.linspace(0.0, 10.0, 100)
+    columns = {k: x for k, x in {'v_b': v, 'y_b': 1e-6 * v}.items() if k != lacks}
+    record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0, channels=columns)
+    with pytest.raises(pi.DataError, match=names):
+        pi.free_run(scanner(), record)
+
+
+def test_an_axis_that_was_measured_is_compared_alone():
+    whole = play(*raster(500))
+    (piece,) = whole
+    part = replace(piece, channels={'v_b': piece.channels['v_b']})
+    run = pi.free_run(scanner(), replace(whole, pieces=(part,)), ['y'])
+    assert list(run) == ['y'] and run['y'].errors.percent < 0.02
+
+
+def test_steps_of_one_axis_are_refused_for_several():
+    with pytest.raises(pi.ConfigError, match='y, y_b'):
+        pi.identify(play(*raster(500)), FEW, steps=Steps())
+
+
+def test_axes_with_one_name_in_c_are_refused():
+    model = MultiAxisModel(dict.fromkeys(('y', 'y_b', 'y_B'), chain([0.1, 0.1, 0.1], 0.5, 1e-6)))
+    with pytest.raises(pi.ConfigError, match='y_b and y_B'):
+        pi.export_c(model)
 
 
 def test_records_of_other_axes_are_refused_though_they_have_one_name():

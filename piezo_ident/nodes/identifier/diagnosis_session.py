@@ -14,6 +14,7 @@ from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.live.capture import Capture
+from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 
@@ -52,27 +53,27 @@ class DiagnosisSession:
 
     Attributes
     ----------
-    given : StageModel or None
+    given : StageModel, MultiAxisModel or None
         The model that is diagnosed.
-    diagnosis : Diagnosis or None
+    diagnosis : Diagnosis, EachAxis of Diagnosis, or None
         Last diagnosis of this model.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
         self._host, self._capture = host, capture
-        self.given: StageModel | None = None
-        self.diagnosis: Diagnosis | None = None
+        self.given: StageModel | MultiAxisModel | None = None
+        self.diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
         # samples up to here went into the model and cannot test it
         self._used: Mapping[str, int] = {}
         self.drop()
 
-    def take(self, model: StageModel, used: Mapping[str, int]) -> None:
+    def take(self, model: StageModel | MultiAxisModel, used: Mapping[str, int]) -> None:
         """
         Take another model to diagnose.
 
         Parameters
         ----------
-        model : StageModel
+        model : StageModel or MultiAxisModel
         used : mapping
             From `Capture.mark`: the capture up to this mark served to identify the model.
         """
@@ -127,7 +128,7 @@ class DiagnosisSession:
             return f'no more than {most} requests are allowed'
         return '' if self._host.can_excite() else 'there is no excitation and no stage'
 
-    def _diagnose(self, given: StageModel) -> None:
+    def _diagnose(self, given: StageModel | MultiAxisModel) -> None:
         settings = DiagnosisSettings(seed=self._host.values['seed'])
         snapshot = self._capture.snapshot(self._used)
         job = functools.partial(

@@ -10,10 +10,12 @@ argument, `tick`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import functools
 import json
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from piezo_ident.common.process import Tick
@@ -22,14 +24,27 @@ from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experim
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import first_steps
 from piezo_ident.identification.results import Identification, Settings, Steps
-from piezo_ident.live.capture import refuse_incomplete, Snapshot
-from piezo_ident.model.files import model_to_yaml
-from piezo_ident.model.free_run import piece_runs
+from piezo_ident.live.capture import (
+    records_of_runs,
+    refuse_incomplete,
+    refuse_missing,
+    Snapshot,
+)
+from piezo_ident.model.free_run import piece_runs, PieceRun
+from piezo_ident.model.multi_axis import (
+    EachAxis,
+    models_of,
+    MultiAxisModel,
+    text_of,
+    voltage_of,
+)
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.record import Record
 from piezo_ident.report import headline, json_text, steps_to_json, write_report
-from piezo_ident.verbs.learn import diagnose_axis, identify_axis
+from piezo_ident.verbs.learn import diagnose, identify, identify_axis
+
+T = TypeVar('T')
 
 #: a program as short as all three steps allow
 _SMALL = """
@@ -78,7 +93,7 @@ class IdentificationOutcome:
         Number of warnings in the report.
     steps : Steps or None
         Results of the steps so far.
-    identification : Identification or None
+    identification : Identification, EachAxis of Identification, or None
     model : str
         YAML; empty without a model.
     """
@@ -89,7 +104,7 @@ class IdentificationOutcome:
     report: str = ''
     warnings: int = 0
     steps: Steps | None = None
-    identification: Identification | None = None
+    identification: Identification | EachAxis[Identification] | None = None
     model: str = ''
 
 
@@ -123,10 +138,16 @@ def settings_of(values: dict[str, object]) -> Settings:
     )
 
 
-def percent_of(step: str, share: float) -> float:
-    """Return the progress of the whole work in percent."""
-    low, high = _SHARES.get(step, (0.0, 1.0))
-    return 100.0 * (low + (high - low) * share)
+def percent_of(step: str, share: float, axes: Sequence[str] = ('y',)) -> float:
+    """
+    Return the progress of the whole work in percent.
+
+    The step of a stage of several axes begins with the name of its axis, one of `axes` in turn.
+    """
+    axis, _, what = step.rpartition(': ')
+    low, high = _SHARES.get(what, (0.0, 1.0))
+    done = low + (high - low) * share
+    return 100.0 * ((axes.index(axis) + done) / len(axes) if axis in axes else done)
 
 
 def identify_capture(
@@ -134,7 +155,8 @@ def identify_capture(
     settings: Settings,
     which: str,
     steps: Steps | None,
-    before: StageModel | None,
+    before: StageModel | MultiAxisModel | None,
+    axes: Sequence[str],
     tick: Tick,
 ) -> IdentificationOutcome:
     """
@@ -147,12 +169,15 @@ def identify_capture(
     which : {'all', 'delay', 'dynamics', 'hysteresis'}
     steps : Steps or None
         Results of earlier steps; for single steps only.
-    before : StageModel or None
+    before : StageModel, MultiAxisModel or None
         Earlier model of this stage.
+    axes : sequence of str
+        Names of further axes.
     tick : callable
     """
     tick('record', 0.0)
     record = snapshot.record('capture')
+    refuse_missing(record, axes)
     tick('record', 0.01)
     refuse_incomplete(record, snapshot.sent())
     records = [record]
@@ -162,33 +187,76 @@ def identify_capture(
         return IdentificationOutcome(
             _sentence(step), report=json.dumps(data), warnings=len(record.faults), steps=step
         )
+    if axes:
+        found = identify(records, settings, progress=tick)
+        if isinstance(found, EachAxis):
+            return _identified(found.mapped(functools.partial(_with_sign, before)))
+        return _identified(_with_sign(before, 'y', found))
     known = (steps or Steps()) if which == 'hysteresis' else None
-    result = identify_axis(records, settings, steps=known, progress=tick)
-    result = replace(result, warnings=(*result.warnings, *_reversed(result.model, before)))
+    one = identify_axis(records, settings, steps=known, progress=tick)
+    one = _with_sign(before, 'y', one)
     tick('report', 0.98)
-    runs = piece_runs(result.model, records, result.memories)
+    runs = piece_runs(one.model, records, one.memories)
     tick('report', 0.99)
-    error, static = (f'{x:.3g}' for x in (result.headline.percent, result.headline.static_percent))
+    steps = Steps(one.delay, (one.dynamics, one.model.dynamics))
+    return replace(_identified(one, runs), steps=steps)
+
+
+def _each(result: T | EachAxis[T]) -> dict[str, T]:
+    """List the results of the axes, by the ends of their topics; '' is the first axis."""
+    if isinstance(result, EachAxis):
+        return {axis[1:]: x for axis, x in result.items()}
+    return {'': result}
+
+
+def _joined(result: T | EachAxis[T], text: Callable[[T], str]) -> str:
+    """Join a text about each axis, under its name if there are several."""
+    if isinstance(result, EachAxis):
+        return '; '.join(f'{axis}: {text(x).rstrip(".")}' for axis, x in result.items())
+    return text(result)
+
+
+def _figures(result: T | EachAxis[T], of: Callable[[T], dict[str, str]]) -> dict[str, str]:
+    """Collect the figures of each axis; those of a further axis end in its name."""
+    return {f'{k}{tail}': x for tail, one in _each(result).items() for k, x in of(one).items()}
+
+
+def _identified(
+    result: Identification | EachAxis[Identification], runs: Sequence[PieceRun] = ()
+) -> IdentificationOutcome:
+    def figures(x: Identification) -> dict[str, str]:
+        error, static = x.headline.percent, x.headline.static_percent
+        return {'error_percent': f'{error:.3g}', 'static_percent': f'{static:.3g}'}
+
+    def brief(x: Identification) -> str:
+        error, static = figures(x).values()
+        return f'{error} % of stroke, hysteresis alone {static} %'
+
     return IdentificationOutcome(
-        message=headline(result),
-        brief=f'{error} % of stroke, hysteresis alone {static} %',
-        figures={'error_percent': error, 'static_percent': static},
+        message=_joined(result, headline),
+        brief=_joined(result, brief),
+        figures=_figures(result, figures),
         report=json_text(result, runs),
-        warnings=len(result.warnings),
-        steps=Steps(result.delay, (result.dynamics, result.model.dynamics)),
+        warnings=sum(len(x.warnings) for x in _each(result).values()),
         identification=result,
-        model=model_to_yaml(result.model),
+        model=text_of(result.model),
     )
 
 
-def _reversed(model: StageModel, before: StageModel | None) -> Iterator[str]:
-    """Yield a warning if the displacement has changed its sign."""
-    if before is not None and model.scaling.Y * before.scaling.Y < 0.0:
-        y, y0 = 1e6 * model.scaling.Y, 1e6 * before.scaling.Y
-        yield (
-            f'the displacement has changed its sign: Y = {y:.4g} um, {y0:.4g} um in the model '
-            "before; look at the sensor's wires, or at the sign in its driver"
-        )
+def _with_sign(
+    before: StageModel | MultiAxisModel | None, axis: str, result: Identification
+) -> Identification:
+    """Add a warning if the displacement of an axis has changed its sign."""
+    known = models_of(before).get(axis) if before is not None else None
+    scaling = result.model.scaling
+    if known is None or scaling.Y * known.scaling.Y > 0.0:
+        return result
+    y, y0 = 1e6 * scaling.Y, 1e6 * known.scaling.Y
+    warning = (
+        f'the displacement has changed its sign: Y = {y:.4g} um, {y0:.4g} um in the model '
+        "before; look at the sensor's wires, or at the sign in its driver"
+    )
+    return replace(result, warnings=(*result.warnings, warning))
 
 
 def _sentence(steps: Steps) -> str:
@@ -206,7 +274,7 @@ class DiagnosisOutcome:
 
     Attributes
     ----------
-    diagnosis : Diagnosis or None
+    diagnosis : Diagnosis, EachAxis of Diagnosis, or None
         None if the capture lacks motion.
     message, brief, report, model, given : str
         Verdict as a sentence, and in few words; diagnosis as JSON; refined and given model as
@@ -219,7 +287,7 @@ class DiagnosisOutcome:
         Experiment that would decide an open question.
     """
 
-    diagnosis: Diagnosis | None
+    diagnosis: Diagnosis | EachAxis[Diagnosis] | None
     message: str = ''
     brief: str = ''
     figures: Mapping[str, str] = field(default_factory=dict)
@@ -230,26 +298,9 @@ class DiagnosisOutcome:
     wanted: Experiment | None = None
 
 
-def records_of_runs(record: Record) -> list[Record]:
-    """
-    Split a record into one record for each run of the sample clock.
-
-    An unknown time passes between two runs, so everything that depends on time starts again.
-    """
-    runs: list[list[Piece]] = []
-    for piece in record:
-        if runs and piece.start_time > runs[-1][-1].start_time:
-            runs[-1].append(piece)
-        else:
-            runs.append([piece])
-    if len(runs) == 1:
-        return [record]
-    return [Record(tuple(pieces), f'{record.name} {i}') for i, pieces in enumerate(runs, 1)]
-
-
 def diagnose_capture(
     snapshot: Snapshot,
-    given: StageModel,
+    given: StageModel | MultiAxisModel,
     asked: tuple[Kind, ...],
     settings: DiagnosisSettings,
     tick: Tick,
@@ -261,7 +312,7 @@ def diagnose_capture(
     ----------
     snapshot : Snapshot
         Capture without the samples that the model was identified from.
-    given : StageModel
+    given : StageModel or MultiAxisModel
     asked : tuple of {'sweeps', 'holds'}
         Experiments that the excitation has played already.
     settings : DiagnosisSettings
@@ -272,37 +323,54 @@ def diagnose_capture(
     records = [r for r in records_of_runs(record) if _is_driven(given, r)]
     if not records:
         return DiagnosisOutcome(None, wanted=next_experiment(None, asked=asked))
-    result = diagnose_axis(given, records, settings, progress=tick)
+    result = diagnose(given, records, settings, progress=tick)
     # every run is a record of its own, so a restart of the clock is harmless
-    faults = (fault for fault in record.faults if fault.name != 'restart')
-    result = replace(result, faults=(*faults, *result.faults))
+    faults = tuple(fault for fault in record.faults if fault.name != 'restart')
+    if isinstance(result, EachAxis):
+        result = result.mapped(lambda _, x: replace(x, faults=(*faults, *x.faults)))
+    else:
+        result = replace(result, faults=(*faults, *result.faults))
     tick('report', 0.99)
-    before, after = (f'{e.overall:.3g}' for e in (result.before, result.after))
+    each = [*_each(result).values()]
+    wishes = (next_experiment(x, records, asked) for x in each)
     return DiagnosisOutcome(
         result,
-        message=result.sentence,
-        brief=f'{after} % of stroke, before {before} %: {_verdict(result)}',
-        figures={'verdict': result.verdict, 'before_percent': before, 'after_percent': after},
+        message=_joined(result, lambda x: x.sentence),
+        brief=_joined(result, _brief),
+        figures=_figures(result, _verdict_of),
         report=json_text(result),
-        model=model_to_yaml(result.model),
-        given=model_to_yaml(given),
-        warnings=len(result.warnings) + sum(not fault.is_note for fault in result.faults),
-        wanted=next_experiment(result, records, asked),
+        model=text_of(result.model),
+        given=text_of(given),
+        warnings=sum(len(x.warnings) + sum(not f.is_note for f in x.faults) for x in each),
+        wanted=next(filter(None, wishes), None),
     )
 
 
-def _verdict(result: Diagnosis) -> str:
+def _verdict_of(result: Diagnosis) -> dict[str, str]:
+    before, after = (f'{e.overall:.3g}' for e in (result.before, result.after))
+    return {'verdict': result.verdict, 'before_percent': before, 'after_percent': after}
+
+
+def _brief(result: Diagnosis) -> str:
+    _, before, after = _verdict_of(result).values()
     names = ' and '.join(effect.name for effect in result.effects)
-    return f'{result.verdict} {names}'.rstrip()
+    return f'{after} % of stroke, before {before} %: {result.verdict} {names}'.rstrip()
 
 
-def _is_driven(model: StageModel, record: Record) -> bool:
-    low, high = model.scaling.range
-    return bool(np.ptp(record.voltage_range) >= DRIVEN * (high - low))
+def _is_driven(model: StageModel | MultiAxisModel, record: Record) -> bool:
+    for axis, x in models_of(model).items():
+        columns = ({**piece.channels, 'v': piece.v}.get(voltage_of(axis), 0.0) for piece in record)
+        ends = [end for v in columns for end in (np.min(v), np.max(v))]
+        if np.ptp(ends) >= DRIVEN * np.ptp(x.scaling.range):
+            return True
+    return False
 
 
 def save(
-    identified: Identification | None, diagnosis: Diagnosis | None, folder: str, tick: Tick
+    identified: Identification | EachAxis[Identification] | None,
+    diagnosis: Diagnosis | EachAxis[Diagnosis] | None,
+    folder: str,
+    tick: Tick,
 ) -> str:
     """Write models, reports and pictures; a diagnosis gets a folder of its own inside."""
     tick('drawing', 0.0)

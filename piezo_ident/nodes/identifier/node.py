@@ -18,9 +18,8 @@ from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
-from piezo_ident.model.files import load
+from piezo_ident.model.multi_axis import EachAxis, load
 from piezo_ident.nodes.given import home_problem
-from piezo_ident.nodes.identifier.axes_job import identify_axes_capture, save_axes
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs
@@ -65,9 +64,8 @@ class IdentifierNode(LabNode):
         self._outcomes: deque[Callable[[], None]] = deque()
         self._state, self._task, self._reported_at = 'idle', '', 0.0
         self._steps = Steps()
-        self._identified: Identification | None = None
-        # the last model of several axes, as text
-        self._axes = ''
+        self._identified: Identification | EachAxis[Identification] | None = None
+        self._axes = [name for name in self.values['axes'] if name]
         self._session = DiagnosisSession(self, self._capture)
         # mark of the capture that the running job uses, and the last published model
         self._using, self._published = dict[str, int](), ''
@@ -76,7 +74,9 @@ class IdentifierNode(LabNode):
         self._rate = Rate()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
-        self._inputs = Inputs(self, self._capture, list(filter(None, self.values['channels'])))
+        topics = [f'{what}_{x}' for x in self._axes for what in ('voltage', 'displacement')]
+        topics += filter(None, self.values['channels'])
+        self._inputs = Inputs(self, self._capture, list(dict.fromkeys(topics)))
         self._excitation = ExcitationClient(
             self, self._inputs.streams, lambda: self._inputs.unpublished
         )
@@ -86,9 +86,7 @@ class IdentifierNode(LabNode):
         self.offer('identify', self._identify_all)
         for step in ('delay', 'dynamics', 'hysteresis'):
             self.offer(f'identify_{step}', functools.partial(self._identify, step))
-        self.offer('run', functools.partial(self._run, self._identify_all))
-        self.offer('run_axes', functools.partial(self._run, self._identify_axes))
-        for name in ('identify_axes', 'diagnose', 'cancel', 'clear', 'save'):
+        for name in ('run', 'diagnose', 'cancel', 'clear', 'save'):
             self.offer(name, getattr(self, f'_{name}'))
 
     def offer(self, name: str, handler: Callable[[], str]) -> None:
@@ -180,21 +178,20 @@ class IdentifierNode(LabNode):
 
     # services
 
-    def _run(self, identify: Callable[[], str]) -> str:
+    def _run(self) -> str:
         self._refuse_when_busy()
         settings_of(self.values)
         # older data may come from another stage, or another day
         about = 'program for the identification'
-        ended = functools.partial(self._run_ended, identify)
-        self.excite(self.values['program'], about, ended, self._forget)
+        self.excite(self.values['program'], about, self._run_ended, self._forget)
         return 'the program is requested; see ~/status'
 
-    def _run_ended(self, identify: Callable[[], str], reason: str | None) -> None:
+    def _run_ended(self, reason: str | None) -> None:
         if reason is not None:
             self.fail(reason)
             return
         try:
-            identify()
+            self._identify_all()
         except PiezoIdentError as error:
             self.fail(str(error))
 
@@ -204,25 +201,24 @@ class IdentifierNode(LabNode):
                 'nothing has been captured; start the excitation, call ~/run, or replay a bag'
             )
 
-    def _identify_axes(self) -> str:
-        self._refuse_when_busy()
-        self._refuse_when_empty()
-        self._task = 'identification of several axes'
-        self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
-        self._start(functools.partial(identify_axes_capture, self._capture.snapshot()))
-        return f'{self._task} has begun; see ~/status'
-
     def _identify_all(self) -> str:
         return self._identify('all')
 
     def _identify(self, which: str) -> str:
         self._refuse_when_busy()
+        if self._axes and which != 'all':
+            raise PiezoIdentError('single steps are for a stage of one axis; call ~/identify')
         self._refuse_when_empty()
         self._using = self._capture.mark()
         settings = settings_of(self.values)
-        before = self._session.given
         job = functools.partial(
-            identify_capture, self._capture.snapshot(), settings, which, self._steps, before
+            identify_capture,
+            self._capture.snapshot(),
+            settings,
+            which,
+            self._steps,
+            self._session.given,
+            self._axes,
         )
         self._task = 'identification' if which == 'all' else f'identification of the {which}'
         self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
@@ -235,18 +231,14 @@ class IdentifierNode(LabNode):
     def _save(self) -> str:
         self._refuse_when_busy()
         identified, folder = self._identified, Path(self.values['output']).expanduser().absolute()
-        if identified is None and self._session.diagnosis is None and not self._axes:
+        if identified is None and self._session.diagnosis is None:
             raise PiezoIdentError('there is no model to save; call ~/identify or ~/run first')
         if not self.values['output']:
             raise PiezoIdentError("parameter 'output' is empty; set it to the folder to write to")
         check_folder(folder)
         self._task = 'saving'
         self._set_state('saving', 0.0, f'writing to {folder}')
-        if self._axes:
-            self._start(functools.partial(save_axes, self._axes, str(folder)))
-        else:
-            job = functools.partial(save, identified, self._session.diagnosis, str(folder))
-            self._start(job)
+        self._start(functools.partial(save, identified, self._session.diagnosis, str(folder)))
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
@@ -324,7 +316,8 @@ class IdentifierNode(LabNode):
 
     def _progress(self, step: str, share: float) -> None:
         state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
-        percent = 100.0 * share if state == 'saving' else percent_of(step, share)
+        axes = ['y', *(f'y_{name}' for name in self._axes)]
+        percent = 100.0 * share if state == 'saving' else percent_of(step, share, axes)
         self.report_status(state, percent, step, brief=f'{percent:.0f} %: {step}')
 
     def _ended(self, result: Result | None, error: Exception | None) -> None:
@@ -347,13 +340,12 @@ class IdentifierNode(LabNode):
         elif isinstance(result, IdentificationOutcome):
             self._steps = result.steps or self._steps
             self._report.publish(String(data=result.report))
-            if result.model:
-                self._axes = '' if result.identification else result.model
+            if result.identification is not None:
                 self._publish_model(result.model)
-            if result.model and result.identification is not None:
                 self._identified = identified = result.identification
                 self._session.take(identified.model, self._using)
-                for warning in identified.warnings:
+                each = identified.values() if isinstance(identified, EachAxis) else [identified]
+                for warning in dict.fromkeys(w for x in each for w in x.warnings):
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
             text, brief = (

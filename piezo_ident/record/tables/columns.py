@@ -149,15 +149,15 @@ def _guessed(
     """Return the places of quantities whose words and units fit one free column alone."""
     guessed: dict[str, int] = {}
     for role in roles:
-        fitting = _fitting(role, [(i, names[i]) for i in free if i not in guessed.values()])
+        near = [i for i in free if i not in guessed.values() and not _is_apart(role, i, names)]
+        fitting = _fitting(role, [(i, names[i]) for i in near])
         if len(fitting) > 1:
             # of several groups, the group whose columns are named already
             groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
             fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
-        if len(fitting) > 1:
+        if len(bare := [i for i in fitting if name_and_unit(names[i])[0] == role]) == 1:
             # v [V] beside v_b [V]
-            bare = [i for i in fitting if name_and_unit(names[i])[0] == role]
-            fitting = bare if len(bare) == 1 else fitting
+            fitting = bare
         if len(fitting) > 1:
             found = [names[i] for i in fitting]
             # numbers tell equal names apart
@@ -167,6 +167,12 @@ def _guessed(
             raise DataError(f'{path}: {fault}; say which: {first} or {second}', options=first)
         guessed.update((role, i) for i in fitting)
     return guessed
+
+
+def _is_apart(role: str, place: int, names: Sequence[str]) -> bool:
+    """Tell whether a column is of a further axis: y_b, with v_b beside v."""
+    bases, partner = [name_and_unit(name)[0] for name in names], {'v': 'y', 'y': 'v'}.get(role, '')
+    return bool(role_of(bases[place])) and {partner, partner + bases[place][1:]} <= {*bases}
 
 
 def _add_channels(

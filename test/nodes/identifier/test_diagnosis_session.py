@@ -9,10 +9,10 @@ from diagnosis_examples import example, measured
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.diagnosis.next_experiment import Experiment
-from piezo_ident.live.capture import Capture
+from piezo_ident.live.capture import Capture, records_of_runs
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
-from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome, records_of_runs
+from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 from piezo_ident.record.blocks import cut_blocks, Samples
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.json_data import json_text

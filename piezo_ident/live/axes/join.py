@@ -1,0 +1,182 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Join the streams of several axes: blocks of the first axis wait for the others of their time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
+from piezo_ident.record.blocks import Samples, SHORTEST
+
+#: most samples that are kept
+MOST = 1_000_000
+
+
+def held(x: Array, before: float) -> Array:
+    """
+    Replace each NaN or infinite sample by the sample before it.
+
+    Without a sample before, which is NaN then, the first finite sample of the block replaces it.
+
+    >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
+    [3.0, 1.0, 1.0]
+    >>> held(np.array([np.nan, 1.0, np.inf]), np.nan).tolist()
+    [1.0, 1.0, 1.0]
+    """
+    good = np.isfinite(x)
+    if good.all():
+        return x
+    if good.any() and not math.isfinite(before):
+        before = float(x[np.argmax(good)])
+    last = np.where(good, np.arange(1, x.size + 1), 0)
+    return np.append(before, x)[np.maximum.accumulate(last)]
+
+
+class Companion:
+    """
+    Samples of one topic by their tick.
+
+    Parameters
+    ----------
+    sample_rate : float
+        [Hz]
+
+    Examples
+    --------
+    >>> voltage = Companion(10.0)
+    >>> voltage.add(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0])))
+    >>> voltage.has(np.array([0.1, 0.2])), voltage.take(np.array([0.1, 0.2])).tolist()
+    (False, [6.0, nan])
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        self._rate = sample_rate
+        self._kept: dict[int, float] = {}
+        self._newest = -1
+
+    def add(self, samples: Samples) -> None:
+        """Keep a block; a block whose time jumps back begins a new stream."""
+        ticks = self._ticks(samples.t)
+        if ticks[0] <= self._newest or len(self._kept) > MOST:
+            self._kept.clear()
+        self._kept.update(zip(ticks, samples.values.tolist(), strict=True))
+        self._newest = ticks[-1]
+
+    def clear(self) -> None:
+        """Forget all samples: the stream has ended."""
+        self._kept.clear()
+        self._newest = -1
+
+    def has(self, t: NDArray[np.float64]) -> bool:
+        """Return whether a sample is kept for each time, shape (n,) [s]."""
+        return all(tick in self._kept for tick in self._ticks(t))
+
+    def take(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Remove and return the samples at the given times; NaN stands for a missing sample."""
+        return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
+
+    def _ticks(self, t: NDArray[np.float64]) -> list[int]:
+        ticks: list[int] = np.rint(t * self._rate).astype(np.int64).tolist()
+        return ticks
+
+
+class Join:
+    """
+    Blocks of the first axis, each of which waits for the other axes at the same times.
+
+    Parameters
+    ----------
+    tails : sequence of str
+        Ends of the topics of the further axes, such as ``_b``.
+    sample_rate : float, optional
+        Rate of the clock of the stream, or one that is finer [Hz].
+    rest : sequence of float, optional
+        Values of the further axes before their first sample.  Default: zero.
+
+    Examples
+    --------
+    >>> join, t = Join(['_b']), np.array([0.0, 0.1])
+    >>> join.add('', Samples(t, np.array([1.0, 2.0])), since=0.0)
+    >>> [*join.complete(is_over=lambda since: False)]
+    []
+    >>> join.add('_b', Samples(t, np.array([3.0, 4.0])), since=0.0)
+    >>> ((samples, _),) = join.complete(is_over=lambda since: False)
+    >>> join.rows(samples)[0].values.tolist()
+    [[1.0, 2.0], [3.0, 4.0]]
+    """
+
+    def __init__(
+        self,
+        tails: Sequence[str],
+        sample_rate: float = 1.0 / SHORTEST,
+        rest: Sequence[float] = (),
+    ) -> None:
+        self._companions = {tail: Companion(sample_rate) for tail in tails}
+        self._last = {**dict.fromkeys(tails, 0.0), **dict(zip(tails, rest, strict=False))}
+        # blocks with a note of the caller, and their arrival
+        self._waiting: deque[tuple[Samples, Any, float]] = deque()
+
+    def add(self, tail: str, samples: Samples, since: float, note: Any = None) -> None:
+        """Take a block of an axis, which came at a time `since` [s]; '' is the first axis."""
+        if tail:
+            self._companions[tail].add(samples)
+        else:
+            self._waiting.append((samples, note, since))
+
+    def complete(
+        self, is_over: Callable[[float], bool], silent: Collection[str] = ()
+    ) -> Iterator[tuple[Samples, Any]]:
+        """
+        Yield the blocks of the first axis whose partners have come, each with its note.
+
+        Parameters
+        ----------
+        is_over : callable
+            Says whether the wait of a block that came at a time [s] is over.
+        silent : collection of str
+            Axes for which no block waits: no node publishes their topics.
+        """
+        while self._waiting:
+            samples, note, since = self._waiting[0]
+            lacking = any(
+                tail not in silent and not companion.has(samples.t)
+                for tail, companion in self._companions.items()
+            )
+            if lacking and not is_over(since):
+                return
+            self._waiting.popleft()
+            yield samples, note
+
+    def take(self, tail: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Remove and return the samples of a further axis; NaN stands for a missing sample."""
+        return self._companions[tail].take(t)
+
+    def rows(self, samples: Samples) -> tuple[Samples, dict[str, int]]:
+        """
+        Add the further axes to a block, a row for each axis; without any the block stays as it is.
+
+        The last sample of an axis stands for its missing samples.
+        The mapping counts the missing samples of each axis that has some.
+        """
+        rows, missing = [samples.values], {}
+        for tail in self._companions:
+            x = self.take(tail, samples.t)
+            if n := int(np.count_nonzero(~np.isfinite(x))):
+                missing[tail] = n
+                x = held(x, self._last[tail])
+            self._last[tail] = float(x[-1])
+            rows.append(x)
+        return (replace(samples, values=np.stack(rows)) if rows[1:] else samples), missing
+
+    def clear(self) -> None:
+        """Forget the further axes: the stream has ended."""
+        for companion in self._companions.values():
+            companion.clear()
