@@ -15,7 +15,7 @@ DECLARED := setup.py setup.cfg pyproject.toml
 SOURCED := $(or $(ROS_DISTRO),$(AMENT_PREFIX_PATH))
 MADE := .venv/.made$(if $(SOURCED),-sourced)
 
-.PHONY: any-record attack coverage docs netns soak
+.PHONY: any-record attack bouc-wen coverage docs netns soak
 .PHONY: demo test lint test-graph test-jazzy bench bench-live study-identification colcon
 .PHONY: crash limits mirror stays-right study study-xy table-one clean distclean
 .DELETE_ON_ERROR:
@@ -120,6 +120,12 @@ soak: .venv/.test
 # unlabelled records of seventeen kinds beside four simple peers, about an hour
 any-record: .venv/.demo
 	.venv/bin/python benchmarks/any_record.py docs/any_record.md
+
+# hysteresis inside the loop of the mechanics, on three springs and their linear models: some
+# minutes
+bouc-wen: .venv/.demo
+	.venv/bin/python benchmarks/bouc_wen.py docs/bouc_wen.md \
+	    --picture docs/images/bouc_wen.png
 
 # what the live model makes of stages that change while they scan: some minutes
 stays-right: .venv/.demo

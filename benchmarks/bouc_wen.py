@@ -17,8 +17,10 @@ a page (`make bouc-wen`).
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 import time
 import warnings
 
@@ -167,3 +169,78 @@ def surrogate(model: pi.StageModel, u: Array, seed: int) -> dict[str, tuple[Arra
     y = np.asarray(model.simulate(u))
     noise = NOISE * np.random.default_rng([7, seed]).standard_normal(y.size)
     return {'fit': (u, y + noise)}
+
+
+def page(results: dict[str, tuple[Result, tuple[str, ...]]], seed: int) -> str:
+    """Return the page, in Markdown, of the result of each spring and of its linear model."""
+    lines = [
+        '# Hysteretic springs',
+        '',
+        'This page tells how well `diagnose` finds hysteresis inside the loop of the mechanics,',
+        'and how much its model errs. The records are made from the equations of the Bouc-Wen',
+        'benchmark (doi:10.4121/12967592): five periods of a multisine of 50 N rms from 5 to',
+        '150 Hz at 750 Hz, with a noise of 8e-6 m. The law with nu = 2 lies outside the',
+        'candidates. Rms error [m] in free run on tests without noise, another multisine and a',
+        'sweep of 10 Hz a minute, before and',
+        f'after the diagnosis. `make bouc-wen` writes this page (seed {seed}).',
+        '',
+        '| spring | judged on | rms of y | linear | diagnosed | found | linear model | time |',
+        '|---|---|---|---|---|---|---|---|',
+    ]
+    for name, (result, of_linear) in results.items():
+        found, none = (', '.join(effects) or 'none' for effects in (result.effects, of_linear))
+        lines += [
+            f'| {name} | {test} | {rms:.3g} | {result.before[test]:.3g} | '
+            f'{result.after[test]:.3g} | {found} | {none} | {result.seconds:.0f} s |'
+            for test, rms in result.rms.items()
+        ]
+    lines += [
+        '',
+        'The column `linear model` holds what is found if the linear model of the spring takes',
+        'its place, with the same noise: nothing should be.',
+        '',
+        '![Force of each spring over its deflection](images/bouc_wen.png)',
+    ]
+    return '\n'.join(lines) + '\n'
+
+
+def draw(path: Path) -> None:
+    """Draw the force that is not linear over the deflection, as a sweep shows it."""
+    import matplotlib
+
+    matplotlib.use('agg')
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(SPRINGS), figsize=(9.0, 3.0), layout='constrained')
+    t = np.arange(round(RATE * FINE)) / (RATE * FINE)
+    for axis, (name, spring) in zip(axes, SPRINGS.items(), strict=True):
+        u, y = respond(40.0 * np.sin(2.0 * np.pi * 20.0 * t), spring)
+        rates = np.gradient(y, 1.0 / RATE), np.gradient(np.gradient(y, 1.0 / RATE), 1.0 / RATE)
+        force = u - M * rates[1] - C * rates[0] - K * y
+        last = slice(-round(RATE / 10.0), -2)
+        axis.plot(1e3 * y[last], force[last])
+        axis.set(title=name, xlabel='y [mm]', ylabel="u - m y'' - c y' - k y [N]")
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Identify and diagnose every spring and its linear model, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('out', type=Path)
+    parser.add_argument('--picture', type=Path, required=True)
+    parser.add_argument('--seed', type=int, default=1)
+    given = parser.parse_args()
+    results = {}
+    for name, spring in SPRINGS.items():
+        made = records(given.seed, spring, PERIODS)
+        result = find(made)
+        of_linear = find(surrogate(result.given, made['fit'][0], given.seed))
+        results[name] = result, of_linear.effects
+        print(name, result.effects, result.before, result.after, of_linear.effects, flush=True)
+    draw(given.picture)
+    given.out.write_text(page(results, given.seed), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

