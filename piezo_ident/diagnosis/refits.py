@@ -192,8 +192,8 @@ def with_numerator(simulator: Simulator, step: Step) -> Step:
     for added in step.fitted.state.effects:
         if not added.effect.contains:
             continue
-        mode = [float(added.values[0][name]) for name in ('frequency', 'damping')]
-        for a in (model.dynamics.a, _poles_of(*mode, model.sample_rate)):
+        frequency, damping = (float(added.values[0][k]) for k in ('frequency', 'damping'))
+        for a in (model.dynamics.a, _poles_of(frequency, damping, model.sample_rate)):
             last = step
             for _ in range(POLISHING):
                 state = _with_other_numerator(simulator, last.fitted.state, a)
