@@ -184,32 +184,45 @@ def with_numerator(simulator: Simulator, step: Step) -> Step:
     """
     Fit the numerator of G again, in turn with all else, beside an effect in the loop of G.
 
-    An identification without the effect has distorted G.  The effect itself moves the mode, so
-    the poles stay.  The result is the given step if its error falls by less than a `POLISH`.
+    An identification without the effect has distorted G.  The effect itself moves its mode, so
+    this pole stays.  Other poles may have imitated the effect, so G is tried without them, too.
+    The result is the given step if its error falls by less than a `POLISH`.
     """
-    best = step
-    if not any(added.effect.contains for added in step.fitted.state.effects):
-        return step
-    for _ in range(POLISHING):
-        state = _with_other_numerator(simulator, best.fitted.state)
-        fitted = fit_jointly(simulator, state, base_at(simulator, state))
-        if not fitted.mean_square <= (1.0 - POLISH) * best.fitted.mean_square:
-            break
-        best = replace(best, fitted=fitted)
+    model, best = simulator.model, step
+    for added in step.fitted.state.effects:
+        if not added.effect.contains:
+            continue
+        frequency, damping = (float(added.values[0][k]) for k in ('frequency', 'damping'))
+        for a in (model.dynamics.a, _poles_of(frequency, damping, model.sample_rate)):
+            last = step
+            for _ in range(POLISHING):
+                state = _with_other_numerator(simulator, last.fitted.state, a)
+                fitted = fit_jointly(simulator, state, base_at(simulator, state))
+                if not fitted.mean_square <= (1.0 - POLISH) * last.fitted.mean_square:
+                    break
+                last = replace(last, fitted=fitted)
+            best = min(best, last, key=lambda one: one.fitted.mean_square)
     return best
 
 
-def _with_other_numerator(simulator: Simulator, state: State) -> State:
+def _poles_of(frequency: float, damping: float, sample_rate: float) -> Array:
+    """Return a_1 and a_2 of a mode."""
+    w = 2.0 * np.pi * frequency / sample_rate
+    pole = np.exp(w * complex(-damping, np.sqrt(1.0 - damping**2)))
+    return np.array([-2.0 * pole.real, abs(pole) ** 2])
+
+
+def _with_other_numerator(simulator: Simulator, state: State, a: Array) -> State:
     rows, model = simulator.rows, simulator.model
     G, delay = model.dynamics, model.delay.samples
     first = max(0, delay - EARLIER)
     taps = range(first, max(delay + G.b.size + 1, first + LEAST_TAPS))
-    ringing = [filter_arx(G.a, np.ones(1), x) for x in simulator.into_g(state)]
+    ringing = [filter_arx(a, np.ones(1), x) for x in simulator.into_g(state)]
     columns = [rows.of([Delay(k).apply(x) for x in ringing]) for k in taps]
     added = simulator.added_columns(state)
     whole = np.column_stack([*columns, added])
     theta: Array = np.asarray(np.linalg.lstsq(whole, rows.x, rcond=None)[0], dtype=np.float64)
-    linear = Dynamics(G.a, theta[: len(taps)]), Delay(first)
+    linear = Dynamics(a, theta[: len(taps)]), Delay(first)
     state = replace(state, retuning=(), linear=linear)
     return state.with_only_added(theta[len(taps) :])
 
