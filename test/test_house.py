@@ -52,7 +52,7 @@ ROOMS = (
 SIZES = {
     'cli': (2100, 11),
     'common': (900, 8),
-    'excitation': (1000, 6),
+    'excitation': (1100, 6),
     'identification': (5000, 20),
     'many': (800, 6),
     'operators': (1900, 10),

@@ -6,11 +6,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
-from piezo_ident.fitting.free_run import Fit
 from piezo_ident.record.record import Piece
+
+if TYPE_CHECKING:
+    # a prediction needs no fit, and no scipy.signal
+    from piezo_ident.fitting.free_run import Fit
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.observer import BEYOND
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.uncertainty.motion import Motion
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 #: entry of a model file, below `identification`
 KEY = 'prediction_band'
@@ -82,7 +82,7 @@ class PredictionBand:
         """Compute lambda, the half width over q at a level."""
         if not 0.0 < level < 1.0:
             raise ConfigError(f'interval must lie between 0 and 1, got {level:g}')
-        quantile = float(student.ppf(0.5 + 0.5 * level, self.kinds))
+        quantile = float(stdtrit(self.kinds, 0.5 + 0.5 * level))
         return quantile * math.sqrt(1.0 + 1.0 / self.kinds) * self.ratio
 
     def to_dict(self) -> dict[str, Any]:

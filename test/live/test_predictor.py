@@ -107,7 +107,7 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
 def test_the_band_of_a_stream_is_that_of_the_whole_voltage():
     band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
     banded, v = model(identification={KEY: band.to_dict()}), drive(2000)
-    predictor = Predictor(0.8)
+    predictor = Predictor(level=0.8)
     predictor.set_model(banded)
     halves = []
     for block in cut(v):

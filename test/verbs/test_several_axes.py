@@ -175,7 +175,7 @@ def test_an_axis_that_was_measured_is_compared_alone():
     whole = play(*raster(500))
     (piece,) = whole
     part = replace(piece, channels={'v_b': piece.channels['v_b']})
-    run = pi.free_run(scanner(), replace(whole, pieces=(part,)), ['y'])
+    run = pi.free_run(scanner(), replace(whole, pieces=(part,)), axes=['y'])
     assert list(run) == ['y'] and run['y'].errors.percent < 0.02
 
 
