@@ -295,7 +295,7 @@ class LoopHysteresis(Effect):
         A spring shows where its mode resonates: the deflection is then larger than the command.
         """
         excited = [m for m in view.modes if m[0] <= view.max_frequency and m[1] < RESONATES]
-        if not excited:
+        if not excited or not view.span:
             return ()
         frequency, damping = min(excited)
         mode = {'frequency': frequency, 'damping': damping}

@@ -68,6 +68,12 @@ class Settings:
     ------
     ConfigError
         If a value is out of range.
+
+    Examples
+    --------
+    Settings of the paper:
+
+    >>> paper = Settings(thresholds=10, solver='swarm')
     """
 
     thresholds: int | None = None

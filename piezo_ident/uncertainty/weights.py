@@ -49,7 +49,8 @@ def weights_of(errors: Mapping[tuple[str, ...], float], kinds: int) -> dict[str,
 
     Examples
     --------
-    >>> weights_of({(): 1.0, ('creep',): 0.1, ('backlash',): 0.9}, 8)
+    >>> weights = weights_of({(): 1.0, ('creep',): 0.1, ('backlash',): 0.9}, 8)
+    >>> {cause: round(weight, 3) for cause, weight in weights.items()}
     {'creep': 1.0, 'none of these': 0.0, 'backlash': 0.0}
     """
     sizes = [len(s) for s in errors if s]

@@ -27,6 +27,8 @@ SEED = st.integers(0, 2**32 - 1)
 #: what the inversion may leave beside an effect, % of stroke; of a model without, `PLAIN`
 PLAIN = 0.01
 LEFT = {'backlash': 0.05, 'periodic_disturbance': 0.2, 'rate_dependent_hysteresis': 0.3}
+# a spring gives way with the motion, and the inverse makes up for it by iteration alone
+LEFT['loop_hysteresis'] = 2.0
 #: effects that leave the motions within reach
 EFFECTS = {
     **VISIBLE,
