@@ -28,6 +28,9 @@ BENDS = 8
 #: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
 RESONATES = math.sqrt(0.5)
 #: laws that are tried: slip over the swing, and its skew, by which a loop softens (above -1) or
+#: largest slip [1/span^n]: an element that slips within a ten thousandth of the span is Coulomb
+#: friction
+STEEPEST = 1e4
 #: hardens (taste: a fit moves both)
 SLIPS, SKEWS = (3.0, 6.0), (0.0, -1.5)
 
@@ -259,7 +262,7 @@ class LoopHysteresis(Effect):
         Parameter('cubic', 'span^-2', 'hardening of the force', 0.0, -20.0, 20.0, step=1e-3),
         Parameter('stiffness', '1', 'stiffness k_i', 0.0, -3.0, 3.0, vector=True, step=1e-3),
         Parameter('threshold', 'span', 'half width r_i', NAN, 0.0, 10.0, True, 0.0, scale='fixed'),
-        Parameter('gamma', 'span^-n', 'slip gamma_i', NAN, 0.0, 1e4, True, 0.0, scale='log'),
+        Parameter('gamma', 'span^-n', 'slip gamma_i', NAN, 0.0, STEEPEST, True, 0.0, scale='log'),
         Parameter('skew', '1', 'skew_i, delta over gamma', NAN, -10.0, 10.0, True, 0.0),
         Parameter('power', '1', 'power n', NAN, 0.5, 4.0, default=1.0, scale='fixed'),
     )
@@ -294,7 +297,8 @@ class LoopHysteresis(Effect):
 
         A spring shows where its mode resonates: the deflection is then larger than the command.
         """
-        excited = [m for m in view.modes if m[0] <= view.max_frequency and m[1] < RESONATES]
+        modes = [m for m in view.modes if m[0] < 0.5 * view.sample_rate and m[1] < RESONATES]
+        excited = [m for m in modes if m[0] <= view.max_frequency]
         if not excited or not view.span:
             return ()
         frequency, damping = min(excited)
@@ -303,7 +307,14 @@ class LoopHysteresis(Effect):
         # not, and the start of a fit lies between
         swing = view.span / math.sqrt(2.0 * damping)
         return tuple(
-            cls.trial({**mode, 'gamma': [slip / swing], 'skew': [skew], 'stiffness': [0.0]})
+            cls.trial(
+                {
+                    **mode,
+                    'gamma': [min(slip / swing, STEEPEST)],
+                    'skew': [skew],
+                    'stiffness': [0.0],
+                }
+            )
             for slip, skew in product(SLIPS, SKEWS)
         )
 
