@@ -27,11 +27,11 @@ PHASE = 0.05
 BENDS = 8
 #: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
 RESONATES = math.sqrt(0.5)
-#: laws that are tried: slip over the swing, and its skew, by which a loop softens (above -1) or
 #: largest slip [1/span^n]: an element that slips within a ten thousandth of the span is Coulomb
 #: friction
 STEEPEST = 1e4
-#: hardens (taste: a fit moves both)
+#: laws that are tried: slip over the swing, and its skew, by which a loop softens (above -1) or
+#: hardens.  They were chosen on one record of Bouc and Wen's law; a fit moves both
 SLIPS, SKEWS = (3.0, 6.0), (0.0, -1.5)
 
 
