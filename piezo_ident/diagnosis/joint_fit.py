@@ -155,6 +155,15 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
     return BaseColumns.of(rows, columns.T)
 
 
+def _require_finite(state: State, e: Array, moving: Array) -> None:
+    """Raise ModelError if an effect runs away, so that no number is left to fit."""
+    with np.errstate(over='ignore', invalid='ignore'):
+        squares = np.append(np.einsum('ij,ij->j', moving, moving), e @ e)
+    if not np.isfinite(squares).all():
+        names = ', '.join(added.name for added in state.effects)
+        raise ModelError(f'the model with {names} runs away on these data')
+
+
 def fit_jointly(
     simulator: Simulator,
     state: State,
@@ -187,6 +196,7 @@ def fit_jointly(
     moving = _derivatives(simulator, state, parameters, tick)
     given = pull_at and pull_at(state, p)
     for done in range(iterations):
+        _require_finite(state, e, moving)
         prior = _prior(rows, e, p, state, parameters)
         pull = _with_known(state, parameters, prior, given)
         before = _loss(e, pull)

@@ -253,7 +253,7 @@ def _contenders(
                 ahead = near < other.mean_square
                 if shows(simulator, other, noise) and not (ahead and is_shown):
                     contenders[i], is_shown = other, True
-        except IdentificationError as error:
+        except (IdentificationError, ModelError) as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
     contenders = [c for c in contenders if shows(simulator, c, noise)]
     contenders.sort(key=lambda c: c.mean_square)
