@@ -25,7 +25,7 @@ from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.multi_axis import EachAxis, load, models_of
+from piezo_ident.model.multi_axis import EachAxis, load, mapped, models_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis_text, to_json, validated
@@ -56,10 +56,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
         diagnosis = diagnose(given, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
     of_axes = models_of(given)
-    if isinstance(diagnosis, EachAxis):
-        diagnosis = diagnosis.mapped(lambda axis, x: _named(x, of_axes[axis], records))
-    else:
-        diagnosis = _named(diagnosis, of_axes['y'], records)
+    diagnosis = mapped(diagnosis, lambda axis, x: _named(x, of_axes[axis], records))
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))

@@ -29,7 +29,7 @@ from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
 from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.multi_axis import (
-    EachAxis,
+    each_of,
     is_measured,
     load,
     models_of,
@@ -88,7 +88,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
             run = free_run(model, record, args.interval, known)
         console.say(str(run))
         data |= to_json(run)
-        runs = {**run} if isinstance(run, EachAxis) else {'y': run}
+        runs = each_of(run)
         lost = sum(x.record.n - x.errors.n for x in runs.values())
         if lost and args.out is not None:
             console.say(f'  {lost} readings are left out: y is nan there in {args.out}')
@@ -106,8 +106,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     if unknown := [axis for axis in models_of(model) if axis not in known]:
         with naming(str(args.model)):
             made = predict(model, record)
-            of_axes = {**made} if isinstance(made, EachAxis) else {'y': made}
-            others = {axis: of_axes[axis] for axis in unknown}
+            others = {axis: each_of(made)[axis] for axis in unknown}
             pieces |= others
             if args.interval:
                 halves |= bands(model, record, others, args.interval)
@@ -145,12 +144,15 @@ def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], pa
 
 
 def print_bands(
-    level: float, halves: Mapping[str, Sequence[Array]], model: Any, console: Console
+    level: float,
+    halves: Mapping[str, Sequence[Array]],
+    model: StageModel | MultiAxisModel,
+    console: Console,
 ) -> dict[str, Any]:
     """Print the mean and the largest half width of each axis; return them for JSON."""
     axes = {}
     for axis, parts in halves.items():
-        span = abs(getattr(model, 'axes', {'y': model})[axis].scaling.Y)
+        span = abs(models_of(model)[axis].scaling.Y)
         half = 100.0 * np.concatenate(parts) / span
         known = half[np.isfinite(half)]
         mean, most = (float(f(known)) if known.size else math.nan for f in (np.mean, np.max))

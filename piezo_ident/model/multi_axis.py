@@ -150,7 +150,6 @@ class EachAxis(Mapping[str, T], Generic[T]):
 
     Examples
     --------
-    >>> from piezo_ident.model.multi_axis import EachAxis
     >>> errors = EachAxis({'y': 0.2, 'y_b': 0.3})
     >>> errors['y_b'], list(errors)
     (0.3, ['y', 'y_b'])
@@ -328,6 +327,16 @@ class MultiAxisModel:
         write_text(path, text_of(self))
 
 
+def each_of(result: T | EachAxis[T]) -> Mapping[str, T]:
+    """List the result of each axis; the one of a stage of one axis is ``y``."""
+    return result if isinstance(result, EachAxis) else {'y': result}
+
+
+def mapped(result: T | EachAxis[T], change: Callable[[str, T], T]) -> T | EachAxis[T]:
+    """Apply a function to the name and the result of each axis, or to ``y`` and the result."""
+    return result.mapped(change) if isinstance(result, EachAxis) else change('y', result)
+
+
 def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """List the model of each axis; the one of a `StageModel` is ``y``."""
     return {'y': model} if isinstance(model, StageModel) else model.axes
@@ -335,9 +344,7 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """List the model of each axis without the paths of the others."""
-    if isinstance(model, StageModel):
-        return {'y': model}
-    return {axis: model.own(axis) for axis in model.axes}
+    return {'y': model} if isinstance(model, StageModel) else {a: model.own(a) for a in model.axes}
 
 
 def text_of(model: StageModel | MultiAxisModel) -> str:
@@ -361,8 +368,7 @@ def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
         isinstance(axes, Mapping) and axes and all(isinstance(x, Mapping) for x in axes.values())
     ):
         raise ModelError(f'{name}: axes must name a model for each axis; see docs/two_axes.md')
-    wrong = [str(k) for k in axes if k != 'y' and role_of(str(k)) != 'y']
-    if wrong:
+    if wrong := [str(k) for k in axes if k != 'y' and role_of(str(k)) != 'y']:
         raise ModelError(f'{name}: axes {", ".join(wrong)}: an axis is y, or y_ and its name')
     try:
         return MultiAxisModel(

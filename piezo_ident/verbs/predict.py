@@ -18,6 +18,7 @@ from piezo_ident.model.multi_axis import (
     axis_record,
     EachAxis,
     is_measured,
+    models_of,
     MultiAxisModel,
 )
 from piezo_ident.model.stage_model import StageModel
@@ -116,9 +117,9 @@ def bands(
     interval: float,
 ) -> dict[str, tuple[Array, ...]]:
     """Compute the half widths [m] of predictions from voltages alone, by axis."""
-    axes = model.axes if isinstance(model, MultiAxisModel) else {'y': model}
+    models = models_of(model)
     seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
-    return {k: half_widths(x, seen[k], predicted[k], interval) for k, x in axes.items()}
+    return {k: half_widths(models[k], seen[k], x, interval) for k, x in predicted.items()}
 
 
 def prediction_doubts(model: StageModel | MultiAxisModel, record: Record) -> tuple[str, ...]:

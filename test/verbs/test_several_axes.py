@@ -12,6 +12,9 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.identification.results import Steps
 from piezo_ident.model.multi_axis import axis_record, MultiAxisModel
+from piezo_ident.uncertainty.band import PredictionBand
+from piezo_ident.uncertainty.promises import with_band
+from piezo_ident.verbs.predict import bands, predict
 import pytest
 
 #: plays voltages from its input through a header, a line a sample
@@ -177,6 +180,14 @@ def test_an_axis_that_was_measured_is_compared_alone():
     part = replace(piece, channels={'v_b': piece.channels['v_b']})
     run = pi.free_run(scanner(), replace(whole, pieces=(part,)), axes=['y'])
     assert list(run) == ['y'] and run['y'].errors.percent < 0.02
+
+
+def test_a_band_is_made_for_the_axes_that_are_predicted():
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    model = MultiAxisModel({axis: with_band(x, band) for axis, x in scanner().axes.items()})
+    record = play(*raster(500))
+    (half,) = bands(model, record, {'y_b': predict(model, record)['y_b']}, 0.9)['y_b']
+    assert half.shape == (500,) and half.min() > 0.0
 
 
 def test_steps_of_one_axis_are_refused_for_several():

@@ -32,7 +32,9 @@ from piezo_ident.live.capture import (
 )
 from piezo_ident.model.free_run import piece_runs, PieceRun
 from piezo_ident.model.multi_axis import (
+    each_of,
     EachAxis,
+    mapped,
     models_of,
     MultiAxisModel,
     text_of,
@@ -189,9 +191,7 @@ def identify_capture(
         )
     if axes:
         found = identify(records, settings, progress=tick)
-        if isinstance(found, EachAxis):
-            return _identified(found.mapped(functools.partial(_with_sign, before)))
-        return _identified(_with_sign(before, 'y', found))
+        return _identified(mapped(found, functools.partial(_with_sign, before)))
     known = (steps or Steps()) if which == 'hysteresis' else None
     one = identify_axis(records, settings, steps=known, progress=tick)
     one = _with_sign(before, 'y', one)
@@ -204,9 +204,7 @@ def identify_capture(
 
 def _each(result: T | EachAxis[T]) -> dict[str, T]:
     """List the results of the axes, by the ends of their topics; '' is the first axis."""
-    if isinstance(result, EachAxis):
-        return {axis[1:]: x for axis, x in result.items()}
-    return {'': result}
+    return {axis[1:]: x for axis, x in each_of(result).items()}
 
 
 def _joined(result: T | EachAxis[T], text: Callable[[T], str]) -> str:
@@ -326,10 +324,7 @@ def diagnose_capture(
     result = diagnose(given, records, settings, progress=tick)
     # every run is a record of its own, so a restart of the clock is harmless
     faults = tuple(fault for fault in record.faults if fault.name != 'restart')
-    if isinstance(result, EachAxis):
-        result = result.mapped(lambda _, x: replace(x, faults=(*faults, *x.faults)))
-    else:
-        result = replace(result, faults=(*faults, *result.faults))
+    result = mapped(result, lambda _, x: replace(x, faults=(*faults, *x.faults)))
     tick('report', 0.99)
     each = [*_each(result).values()]
     wishes = (next_experiment(x, records, asked) for x in each)

@@ -18,7 +18,7 @@ from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
-from piezo_ident.model.multi_axis import EachAxis, load
+from piezo_ident.model.multi_axis import each_of, EachAxis, load
 from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
@@ -344,7 +344,7 @@ class IdentifierNode(LabNode):
                 self._publish_model(result.model)
                 self._identified = identified = result.identification
                 self._session.take(identified.model, self._using)
-                each = identified.values() if isinstance(identified, EachAxis) else [identified]
+                each = each_of(identified).values()
                 for warning in dict.fromkeys(w for x in each for w in x.warnings):
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
