@@ -157,6 +157,8 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
 
 def _require_finite(state: State, e: Array, moving: Array) -> None:
     """Raise ModelError if an effect runs away, so that no number is left to fit."""
+    if not state.effects:
+        return
     with np.errstate(over='ignore', invalid='ignore'):
         squares = np.append(np.einsum('ij,ij->j', moving, moving), e @ e)
     if not np.isfinite(squares).all():

@@ -45,7 +45,9 @@ def test_the_demo_finds_what_is_hidden_and_its_page_leads_to_the_rest(tmp_path):
         capture_output=True,
         text=True,
     )
-    assert (done.returncode, done.stderr) == (0, '')
+    # numba compiles where its cache is cold
+    said = [line for line in done.stderr.splitlines() if not line.startswith('compiling the')]
+    assert (done.returncode, said) == (0, [])
     # one line says what is missing
     assert 'the nodes cannot run here' in done.stdout.splitlines()[0]
     before, after = (
