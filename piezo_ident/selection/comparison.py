@@ -23,6 +23,9 @@ from piezo_ident.fitting.free_run import Fit
 ALIKE = 1.1
 #: an effect must lower the mean square to at most this share of its value without the effect
 EFFECT = 0.4
+#: least mean square that is told from zero: the square of 1e-10 of the stroke, which is below a
+#: hundredth of a step of a 24-bit converter; rounding decides between smaller ones
+RESOLVED = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +51,8 @@ class Candidate:
 
     @property
     def error(self) -> float:
-        """Geometric mean of the two mean squares."""
-        return float(np.sqrt(self.blocks * self.kinds))
+        """Geometric mean of the two mean squares, at least `RESOLVED`."""
+        return max(float(np.sqrt(self.blocks * self.kinds)), RESOLVED)
 
     @property
     def price(self) -> float:
@@ -75,10 +78,13 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     """
     Choose the candidate with the lowest price; of alike prices, the fewest parameters.
 
-    The lower price decides between equal numbers of parameters.
+    The lower price decides between equal numbers of parameters.  Of candidates without a resolved
+    error the first is chosen: which weights of theirs are zero is a matter of rounding.
     """
     least = min(c.price for c in candidates)
     alike = [c for c in candidates if c.price <= ALIKE * least]
+    if least <= RESOLVED:
+        return min(alike, key=lambda c: c.price)
     return min(alike, key=lambda c: (c.fit.stage.size, c.price))
 
 

@@ -32,6 +32,12 @@ def test_of_those_alike_and_as_small_the_better_wins():
     assert best_of([one('a', 1.0), one('b', 0.99)]).name == 'b'
 
 
+def test_rounding_does_not_decide():
+    assert best_of([one('plays', 3e-32, 30), one('wide', 1e-32, 20)]).name == 'plays'
+    assert best_of([one('plays', 3e-32, 30), one('creep', 0.0, 20, 1)]).name == 'plays'
+    assert best_of([one('line', 1e-12, 3), one('plays', 1e-32, 30)]).name == 'plays'
+
+
 def test_an_effect_that_helps_too_little_to_be_taken_is_shown():
     plain = one('plain', 1.0)
     little, much = one('little', 0.99 / ALIKE, 5, 1), one('hardly', 1.01 / ALIKE, 5, 1)
