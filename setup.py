@@ -62,6 +62,8 @@ setup(
         (f'share/{package_name}/config', sorted(glob('config/*.*'))),
         (f'share/{package_name}/config/security', sorted(glob('config/security/*.xml'))),
         (f'share/{package_name}/launch', sorted(glob('launch/*.py'))),
+        # for ros2 run; in a PATH they would clash with other programs
+        (f'lib/{package_name}', sorted(glob('launch/nodes/*'))),
         (f'share/{package_name}/examples', sorted(glob('examples/*.*'))),
     ],
     python_requires='>=3.10',
@@ -131,15 +133,6 @@ setup(
     description='Identifies piezo nanopositioning stages: delay, dynamics, hysteresis and more',
     license='Apache-2.0',
     entry_points={
-        'console_scripts': [
-            'piezo_ident = piezo_ident.cli:main',
-            'excitation = piezo_ident.nodes.main:excitation',
-            'stage = piezo_ident.nodes.main:stage',
-            'identifier = piezo_ident.nodes.main:identifier',
-            'model = piezo_ident.nodes.main:model',
-            'recorder = piezo_ident.nodes.main:recorder',
-            'player = piezo_ident.nodes.main:player',
-            'feedforward = piezo_ident.nodes.main:feedforward',
-        ],
+        'console_scripts': ['piezo_ident = piezo_ident.cli:main'],
     },
 )

@@ -90,7 +90,7 @@ class Nodes:
     ) -> None:
         """Start a node; `arguments` stand before ``--ros-args``."""
         name = f'{namespace}/{executable}'.lstrip('/')
-        code = f'from piezo_ident.nodes.main import {executable}; {executable}()'
+        code = f'from piezo_ident.nodes.main import start; start({executable!r})'
         command = [sys.executable, '-c', code, *arguments, '--ros-args']
         if namespace:
             command += ['-r', f'__ns:=/{namespace.strip("/")}']

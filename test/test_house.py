@@ -50,7 +50,7 @@ ROOMS = (
 
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
-    'cli': (2100, 11),
+    'cli': (2100, 12),
     'common': (900, 8),
     'excitation': (1100, 6),
     'identification': (5000, 20),

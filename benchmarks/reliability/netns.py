@@ -128,7 +128,7 @@ class Hosts:
         """Start a node on a host."""
         file = self.folder / f'{executable}.yaml'
         file.write_text(json.dumps({'/**': {'ros__parameters': dict(parameters)}}))
-        code = f'from piezo_ident.nodes.main import {executable}; {executable}()'
+        code = f'from piezo_ident.nodes.main import start; start({executable!r})'
         arguments = ['--ros-args', '--params-file', str(file)] if parameters else ['--ros-args']
         self.start(host, [sys.executable, '-c', code, *arguments], executable)
 

@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import difflib
 import inspect
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from piezo_ident.cli.console import Console
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, did_you_mean
 from piezo_ident.effects import catalogue, Effect, Parameter
 from piezo_ident.report.table import plain_text, Table
 
@@ -22,8 +21,8 @@ def effect_name(text: str) -> str:
     """Check the name of an effect; ConfigError suggests a similar name."""
     if text in catalogue():
         return text
-    close = difflib.get_close_matches(text.lower().replace('-', '_'), catalogue(), n=1)
-    cure = f'did you mean {close[0]}?' if close else 'see piezo_ident effects'
+    guess = did_you_mean(text.lower().replace('-', '_'), catalogue())
+    cure = guess or 'see piezo_ident effects'
     raise ConfigError(f'unknown effect {text!r}; {cure}')
 
 

@@ -10,8 +10,7 @@ Heavy modules are imported after the arguments are parsed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-import difflib
+from collections.abc import Mapping, Sequence
 import importlib
 import json
 import os
@@ -26,7 +25,7 @@ from click.shell_completion import get_completion_class
 from piezo_ident import __version__
 from piezo_ident.cli import options
 from piezo_ident.cli.console import Console
-from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.common.errors import did_you_mean, PiezoIdentError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 #: module of each verb that shares one; any other verb has a module of its own name
@@ -43,11 +42,6 @@ OUT_HELP = 'OUT is a .csv, .npz, .mat, .mcap or .db3 file, or a folder for a ros
 def _examples(lines: Sequence[str]) -> str:
     # \b makes click keep the lines
     return '\n'.join(['\b', 'Examples:', *(f'  piezo_ident {line}' for line in lines)])
-
-
-def _guess(word: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, known, n=1)
-    return f'did you mean {close[0]}?' if close else ''
 
 
 class Verb(click.Command):
@@ -103,7 +97,7 @@ class Verbs(click.Group):
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """Return the verb and its arguments."""
         if not ctx.resilient_parsing and args[0] not in self.commands:
-            guess = _guess(args[0], self.commands) or f'give {", ".join(self.commands)}'
+            guess = did_you_mean(args[0], self.commands) or f'give {", ".join(self.commands)}'
             ctx.fail(f'no such verb: {args[0]}; {guess}')
         return super().resolve_command(ctx, args)
 
@@ -220,6 +214,20 @@ cli = Verbs(
             'convert samples.txt record.csv --rate 20e3 --columns v=1,y=2 --displacement-unit um',
             'convert recorded_bag/ record.csv',
         ),
+        click.Command(
+            'node',
+            params=[options.NODE, options.NODE_ARGUMENTS],
+            callback=lambda **given: SimpleNamespace(verb='node', json=False, **given),
+            # what follows the name is for ROS
+            context_settings={
+                **SETTINGS,
+                'ignore_unknown_options': True,
+                'allow_interspersed_args': False,
+            },
+            help='Start a node without the tools of ROS.\n\nNAME is a node; without it they are '
+            'listed. ARGUMENTS are those of ROS.',
+            epilog=_examples(['node model --help', 'node model --ros-args -r __ns:=/stage_a']),
+        ),
         Verb(
             'effects',
             'List the effects that a model can have, or say more about one.',
@@ -236,7 +244,7 @@ click.version_option(__version__, message='piezo_ident %(version)s')(cli)
 def _told(error: click.UsageError) -> str:
     text = error.format_message()
     if isinstance(error, click.NoSuchOption):
-        guess = _guess(error.option_name, error.possibilities or ())
+        guess = did_you_mean(error.option_name, error.possibilities or ())
         text = f'no such option: {error.option_name}{guess and "; "}{guess}'
     return f'{text} (see {error.ctx.command_path if error.ctx else "piezo_ident"} --help)'
 

@@ -130,6 +130,8 @@ RECORD, RECORDS = (
     _argument('records', 'RECORD...', nargs=-1, required=True),
 )
 EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effects))
+NODE = _argument('name', '[NAME]', type=str, required=False)
+NODE_ARGUMENTS = _argument('arguments', '[ARGUMENTS]...', nargs=-1, type=click.UNPROCESSED)
 
 #: options for reading records: fields of `ReadOptions`, which holds their defaults
 READING = [

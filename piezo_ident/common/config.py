@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import difflib
 import os
 from pathlib import Path
 import site
 import sys
 import sysconfig
 
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, did_you_mean
 
 _SHARE = Path('share', 'piezo_ident', 'config')
 _SOURCE = Path(__file__).resolve().parents[2] / 'config'
@@ -59,8 +58,8 @@ def find_config(name: str | os.PathLike[str], kind: str) -> Path:
         return path
     known = shipped_names(f'{kind}_')
     stem = path.stem.removeprefix(f'{kind}_')
-    close = difflib.get_close_matches(stem, known, n=1)
-    guess = f'did you mean {close[0]}? ' if close else ''
+    guess = did_you_mean(stem, known)
     raise ConfigError(
-        f'{name}: no such {kind}; {guess}give a file, or one of {", ".join(known) or "none"}'
+        f'{name}: no such {kind}; {guess}{guess and " "}give a file, or one of '
+        f'{", ".join(known) or "none"}'
     )

@@ -3,8 +3,9 @@
 
 """Exceptions of the package: each message names the fault, its place, and its cure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import difflib
 
 #: longest message [characters]: it may quote a file
 _LONGEST = 4000
@@ -85,3 +86,9 @@ def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) 
         kinds = kind if isinstance(kind, tuple) else (kind,)
         names = ' or '.join(k.__name__ for k in kinds)
         raise DataError(f'{where}: expected {names}, got {type(value).__name__}; {hint}')
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Guess the known word that was meant; an empty text if none resembles `word`."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f'did you mean {close[0]}?' if close else ''

@@ -11,14 +11,13 @@ alone, against the old values of the others.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-import difflib
 from pathlib import Path
 import re
 import sys
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError, did_you_mean, PiezoIdentError
 from piezo_ident.nodes.journal import Journal, shown
 from piezo_ident.nodes.parameters import Declaration
 from piezo_ident.record.channels import role_of
@@ -74,9 +73,8 @@ def axes_problem(names: Sequence[str]) -> str | None:
 def no_parameter(node: Node, name: str) -> str:
     """Say that a node has no such parameter, and guess the intended name."""
     known = node.list_parameters([], 0).names
-    close = difflib.get_close_matches(name, known, n=1)
-    guess = f'; did you mean {close[0]}?' if close else ''
-    return f'{name} is no parameter of this node{guess}'
+    guess = did_you_mean(name, known)
+    return f'{name} is no parameter of this node{guess and "; "}{guess}'
 
 
 def unknown_to(node: Node) -> Iterator[str]:

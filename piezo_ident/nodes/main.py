@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Executables of the package: one function for each node.
+Start a node by its name.
 
 A node imports and compiles for seconds.  Its module is therefore imported after `ENDING` listens
 for signals.
@@ -10,24 +10,41 @@ for signals.
 
 from __future__ import annotations
 
-from functools import partial
 import importlib
+import sys
 
 from piezo_ident.nodes.ending import ENDING
 
+#: module, class and purpose of each node
+NODES = {
+    'excitation': ('excitation', 'ExcitationNode', 'plays programs of voltage or of reference'),
+    'stage': ('stage', 'StageNode', 'simulates a stage'),
+    'identifier': ('identifier.node', 'IdentifierNode', 'captures, identifies and diagnoses'),
+    'model': ('model', 'ModelNode', 'predicts the displacement, and estimates it with the sensor'),
+    'recorder': ('recorder', 'RecorderNode', 'writes topics into a bag'),
+    'player': ('player', 'PlayerNode', 'plays a bag back'),
+    'feedforward': ('feedforward', 'FeedforwardNode', 'makes the voltage for a reference'),
+}
 
-def _run(module: str, name: str) -> None:
+
+def start(name: str) -> None:
+    """
+    Run a node until a signal ends the process.
+
+    Without ROS, the process ends with exit code 2 and one line on standard error.
+    """
+    module, node, _ = NODES[name]
     ENDING.listen()
-    node = getattr(importlib.import_module(f'piezo_ident.nodes.{module}'), name)
-    from piezo_ident.nodes.lab_node import run
-
-    ENDING.leave(run(node))
-
-
-excitation = partial(_run, 'excitation', 'ExcitationNode')
-feedforward = partial(_run, 'feedforward', 'FeedforwardNode')
-identifier = partial(_run, 'identifier.node', 'IdentifierNode')
-model = partial(_run, 'model', 'ModelNode')
-player = partial(_run, 'player', 'PlayerNode')
-recorder = partial(_run, 'recorder', 'RecorderNode')
-stage = partial(_run, 'stage', 'StageNode')
+    try:
+        kind = getattr(importlib.import_module(f'piezo_ident.nodes.{module}'), node)
+        from piezo_ident.nodes.lab_node import run
+    except ModuleNotFoundError as error:
+        if (error.name or 'piezo_ident').startswith('piezo_ident'):
+            raise
+        sys.stderr.write(
+            f'piezo_ident: error: the node {name} needs {error.name} of ROS 2 Jazzy: source '
+            '/opt/ros/jazzy/setup.bash, or without a ROS installation: pip install '
+            "'piezo_ident[ros]'\n"
+        )
+        ENDING.leave(2)
+    ENDING.leave(run(kind))

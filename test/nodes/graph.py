@@ -167,7 +167,7 @@ class Graph(Observer):
         command = [
             sys.executable,
             '-c',
-            f'from piezo_ident.nodes.main import {executable}; {executable}()',
+            f'from piezo_ident.nodes.main import start; start({executable!r})',
             '--ros-args',
         ]
         if namespace:

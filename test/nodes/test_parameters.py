@@ -5,8 +5,10 @@
 
 import ast
 import json
+import os
 
 from graph_page import ROOT, table
+from piezo_ident.nodes import main
 from piezo_ident.nodes.parameters import NODES
 import pytest
 import yaml
@@ -54,14 +56,16 @@ def test_every_key_of_the_yaml_files_is_declared(node):
 
 
 def test_executables_of_launch_files_are_installed():
-    setup = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    scripts = {path.name: path for path in (ROOT / 'launch/nodes').iterdir()}
+    assert set(scripts) == set(NODES) == set(main.NODES)
+    for name, path in scripts.items():
+        assert os.access(path, os.X_OK)
+        assert path.read_text(encoding='utf-8').endswith(f"\n\nstart('{name}')\n")
     for path in (ROOT / 'launch').glob('*.launch.py'):
         calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
         for call in calls:
             if getattr(call.func, 'id', '') == 'node':
-                assert f"'{call.args[0].value} = piezo_ident.nodes." in setup
-    for node in NODES:
-        assert f"'{node} = piezo_ident.nodes.main:{node}'" in setup
+                assert call.args[0].value in scripts
 
 
 def test_foxglove_labels_a_path_by_what_the_preview_holds():
