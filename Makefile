@@ -151,7 +151,7 @@ colcon: .venv/.colcon
 	test -x install/piezo_ident/lib/piezo_ident/piezo_ident
 	test -f install/piezo_ident/share/piezo_ident/package.xml
 	test -f install/piezo_ident/share/ament_index/resource_index/packages/piezo_ident
-	bash -c '. install/setup.bash && .venv/bin/python .ci/installed_nodes.py install/piezo_ident'
+	bash -c '. .venv/bin/activate && . install/setup.bash && python .ci/installed_nodes.py install/piezo_ident'
 
 # one environment, more of it as it is asked for
 .venv/.demo: EXTRAS := $(if $(SOURCED),,[ros])

@@ -31,7 +31,7 @@ def start(name: str) -> None:
     """
     Run a node until a signal ends the process.
 
-    Without ROS, the process ends with exit code 2 and one line on standard error.
+    Without ROS, or another module, the process ends with exit code 2 and one line.
     """
     module, node, _ = NODES[name]
     ENDING.listen()
@@ -39,12 +39,16 @@ def start(name: str) -> None:
         kind = getattr(importlib.import_module(f'piezo_ident.nodes.{module}'), node)
         from piezo_ident.nodes.lab_node import run
     except ModuleNotFoundError as error:
-        if (error.name or 'piezo_ident').startswith('piezo_ident'):
+        missing = (error.name or 'piezo_ident').partition('.')[0]
+        if missing == 'piezo_ident':
             raise
+        cure = f'{sys.executable} -m pip install {missing}'
+        if missing == 'rclpy' or missing.endswith(('_msgs', '_srvs')):
+            cure = 'source /opt/ros/jazzy/setup.bash, or without a ROS installation: pip install '
+            cure += "'piezo_ident[ros]'"
         sys.stderr.write(
-            f'piezo_ident: error: the node {name} needs {error.name} of ROS 2 Jazzy: source '
-            '/opt/ros/jazzy/setup.bash, or without a ROS installation: pip install '
-            "'piezo_ident[ros]'\n"
+            f'piezo_ident: error: the node {name} needs {missing}, which {sys.executable} does '
+            f'not have: {cure}\n'
         )
         ENDING.leave(2)
     ENDING.leave(run(kind))

@@ -60,7 +60,7 @@ def test_executables_of_launch_files_are_installed():
     assert set(scripts) == set(NODES) == set(main.NODES)
     for name, path in scripts.items():
         assert os.access(path, os.X_OK)
-        assert path.read_text(encoding='utf-8').endswith(f"\n\nstart('{name}')\n")
+        assert path.read_text(encoding='utf-8').endswith(f"\n    start('{name}')\n")
     for path in (ROOT / 'launch').glob('*.launch.py'):
         calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
         for call in calls:
