@@ -6,11 +6,14 @@
 import ast
 import doctest
 import inspect
+import json
 from pathlib import Path
 import subprocess
 import sys
 
+import numpy as np
 import piezo_ident as pi
+from piezo_ident.model.multi_axis import EachAxis
 import pytest
 from test_doctest import MODULES
 
@@ -80,3 +83,43 @@ def test_arguments_of_another_kind_cost_one_line(tmp_path):
     ):
         with pytest.raises(pi.DataError, match=r'expected|vector'):
             call()
+
+
+@pytest.fixture(scope='module')
+def results():
+    """Return a result of each verb, of one axis and of two."""
+    model = pi.SimulatedStage.load('paper').model
+    v = 5 - 5 * np.cos(2 * np.pi * 50 * np.arange(4000) / 20e3)
+    record = pi.Record.from_arrays(v, model.simulate(v), sample_rate=20e3)
+    one = {
+        'identify': pi.identify(record),
+        'free_run': pi.free_run(model, record),
+        'diagnose': pi.diagnose(model, record, pi.DiagnosisSettings(effects=('saturation',))),
+        'invert': pi.invert(model, np.linspace(20e-6, 30e-6, 500)),
+    }
+    two = {
+        f'{verb}, two axes': EachAxis({'y': one[verb], 'y_b': one[verb]})
+        for verb in ('identify', 'free_run', 'diagnose')
+    }
+    wanted = {'y': np.linspace(20e-6, 30e-6, 500)}
+    stage = pi.MultiAxisModel({'y': model, 'y_b': model})
+    return {**one, **two, 'invert, two axes': pi.invert(stage, wanted)}
+
+
+@pytest.mark.parametrize('axes', ['', ', two axes'])
+@pytest.mark.parametrize('verb', ['identify', 'free_run', 'diagnose', 'invert'])
+def test_every_result_has_the_same_members(results, verb, axes):
+    result = results[verb + axes]
+    model, pictures = result.model, result.plot()
+    assert isinstance(model, pi.MultiAxisModel if axes else pi.StageModel)
+    assert result.errors
+    assert all(isinstance(text, str) for text in result.warnings)
+    for picture in pictures.values() if axes else [pictures]:
+        assert picture.axes
+    json.dumps(result.to_json(), allow_nan=False)
+    assert len(repr(result).splitlines()) > 1
+
+
+def test_the_catalogue_of_effects_is_printed():
+    lines = repr(pi.effects).splitlines()
+    assert [line.split()[0] for line in lines] == sorted(pi.effects.catalogue())

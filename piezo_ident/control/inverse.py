@@ -73,6 +73,8 @@ class Inverse(Showable):
 
     Attributes
     ----------
+    model : StageModel
+        The inverted model.
     t : ndarray, shape (n,)
         Time [s].  The wanted motion begins at 0; the voltage may begin earlier.
     v : ndarray, shape (n,)
@@ -109,6 +111,7 @@ class Inverse(Showable):
     (True, False)
     """
 
+    model: StageModel
     t: Array
     v: Array
     wanted: Array
@@ -121,6 +124,11 @@ class Inverse(Showable):
     expected_rms: float | None
     expected_offset: float | None
     warnings: tuple[str, ...]
+
+    @property
+    def errors(self) -> Mapping[str, float | None]:
+        """Error of the inversion alone, and expected error of the stage."""
+        return {'inversion': self.error, 'expected': self.expected}
 
 
 def invert(
@@ -196,6 +204,7 @@ def invert(
         )
     span = task.span * abs(s.Y)
     return Inverse(
+        model=model,
         t=task.t[used],
         v=v,
         wanted=np.pad(y, (lead, 0), mode='edge'),

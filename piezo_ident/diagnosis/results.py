@@ -307,6 +307,11 @@ class Diagnosis(Showable):
     weights: Mapping[str, float] = field(default_factory=dict)
 
     @property
+    def errors(self) -> Mapping[str, float]:
+        """Errors of the three models over all kinds of motion, % of stroke."""
+        return {name: getattr(self, name).overall for name in ('before', 'refit', 'after')}
+
+    @property
     def changes(self) -> tuple[str, ...]:
         """Changes from the given to the refined model in words; empty if there are none."""
         return changes(self.given, self.model)

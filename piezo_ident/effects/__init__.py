@@ -18,7 +18,8 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import entry_points
 import reprlib
-from types import MappingProxyType
+import sys
+from types import MappingProxyType, ModuleType
 import warnings
 
 from piezo_ident.common.errors import ModelError
@@ -65,6 +66,17 @@ _OWN: tuple[type[Effect], ...] = (
     SlewLimit,
     ThermalDrift,
 )
+
+
+class _Printed(ModuleType):
+    """This module, which shows the catalogue at a prompt."""
+
+    def __repr__(self) -> str:
+        effects = sorted(catalogue().items())
+        return '\n'.join(f'{name:28}{effect.description}' for name, effect in effects)
+
+
+sys.modules[__name__].__class__ = _Printed
 
 
 @cache

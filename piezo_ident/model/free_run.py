@@ -71,6 +71,7 @@ class FreeRun(Showable):
 
     Attributes
     ----------
+    model : StageModel
     record : Record
         Record with masks that leave out faulty readings; its faults count them.
     pieces : tuple of ndarray
@@ -99,6 +100,7 @@ class FreeRun(Showable):
     True
     """
 
+    model: StageModel
     record: Record
     pieces: tuple[Array, ...]
     estimated: tuple[bool, ...]
@@ -154,6 +156,7 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
     pairs = [(piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True)]
     warnings += [f'{record.name}: {doubt}' for doubt in doubts(pairs, model.scaling.Y)]
     return FreeRun(
+        model=model,
         record=record,
         pieces=tuple(predicted),
         estimated=tuple(estimated),

@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import os
 from types import MappingProxyType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +40,9 @@ from piezo_ident.model.free_run import free_run, predict
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 T = TypeVar('T')
 
@@ -184,7 +187,31 @@ class EachAxis(Mapping[str, T], Generic[T]):
     @property
     def model(self) -> MultiAxisModel:
         """Model of the stage, from results that hold a model for each axis."""
-        return MultiAxisModel({axis: x.model for axis, x in self.items()})  # type: ignore[attr-defined]
+        return MultiAxisModel(self._of_each('model'))
+
+    @property
+    def errors(self) -> Mapping[str, Any]:
+        """The `errors` of each axis."""
+        return self._of_each('errors')
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The `warnings` of all axes, each behind the name of its axis."""
+        warnings = self._of_each('warnings')
+        return tuple(f'axis {axis}: {text}' for axis, texts in warnings.items() for text in texts)
+
+    def plot(self) -> dict[str, Figure]:
+        """Draw the picture of each axis."""
+        return {axis: plot() for axis, plot in self._of_each('plot').items()}
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert the results to plain data for strict JSON."""
+        import piezo_ident as pi
+
+        return pi.report.to_json(self)
+
+    def _of_each(self, attribute: str) -> dict[str, Any]:
+        return {axis: getattr(result, attribute) for axis, result in self.items()}
 
 
 @dataclass(frozen=True, eq=False)

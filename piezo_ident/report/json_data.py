@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
 
     One = Identification | Diagnosis | FreeRun | Inverse | Record
-    Shown = One | EachAxis[Identification] | EachAxis[Diagnosis] | EachAxis[FreeRun]
+    Shown = One | EachAxis[Any]
 
 VERSION = {'schema_version': 1, 'package_version': __version__}
 #: a diagnosis has weights and promises since 2

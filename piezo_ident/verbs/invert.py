@@ -44,7 +44,7 @@ class MultiAxisInverse(EachAxis[Inverse]):
         Displacement of the whole model under these voltages, by axis [m].
     lead : int
         Samples by which the voltages begin before the wanted motion.
-    errors : dict of str to float
+    remaining : dict of str to float
         100 rms(wanted - predicted) / (max wanted - min wanted), without the lead.
 
     Examples
@@ -61,7 +61,12 @@ class MultiAxisInverse(EachAxis[Inverse]):
     voltages: Mapping[str, Array]
     predicted: Mapping[str, Array]
     lead: int
-    errors: Mapping[str, float]
+    remaining: Mapping[str, float]
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """The errors of the inversion, as `remaining`."""
+        return self.remaining
 
     def __repr__(self) -> str:
         """Describe the inverse of each axis, and the errors of the whole stage."""
