@@ -57,6 +57,17 @@ def code_blocks(text: str, kind: str = 'python') -> list[str]:
     return [block for name, block in _blocks(text) if name == kind]
 
 
+def outputs(text: str) -> list[str]:
+    """Return the output that the page shows of each block of Python; empty without one."""
+    shown: list[str] = []
+    for kind, block in _blocks(text):
+        if kind == 'python':
+            shown.append('')
+        elif kind == 'text':
+            shown[-1] = block
+    return shown
+
+
 def notebook(text: str) -> Any:
     """Return the page as a notebook: Python as code, the rest as Markdown without outputs."""
     cells: list[Any] = [v4.new_code_cell('%matplotlib inline')]

@@ -21,6 +21,11 @@ ROOT = Path(__file__).resolve().parents[2]
 OUTPUTS = ('--model', '--out', '--report')
 
 
+def numbers(text):
+    """Return the numbers in a text."""
+    return [float(word) for word in re.findall(r'(?<![\w.])-?\d+\.?\d*(?:e[+-]?\d+)?', text)]
+
+
 @pytest.fixture(scope='module')
 def tutorial():
     path = ROOT / 'docs/refresh_tutorial.py'
@@ -49,6 +54,16 @@ def test_the_notebook_runs(tutorial, tmp_path):
     nbclient.NotebookClient(
         notebook, timeout=None, resources={'metadata': {'path': str(tmp_path)}}
     ).execute()
+    cells = [cell for cell in notebook.cells if cell.cell_type == 'code'][1:]
+    page = tutorial.outputs(tutorial.PAGE.read_text(encoding='utf-8'))
+    for cell, expected in zip(cells, page, strict=True):
+        said = ''.join(
+            o.get('text', o.get('data', {}).get('text/plain', '')) for o in cell['outputs']
+        )
+        if expected:
+            # other processors round otherwise
+            stale = f'run python docs/refresh_tutorial.py:\n{expected}\n{said}'
+            assert numbers(said) == pytest.approx(numbers(expected), rel=0.1, abs=2e-3), stale
     outputs = [o for cell in notebook.cells for o in cell.get('outputs', ())]
     shown = [output.get('data', {}) for output in outputs]
     # results and pictures show themselves, and the story is that of the page
