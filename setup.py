@@ -53,7 +53,8 @@ setup(
     packages=find_packages(include=[package_name, f'{package_name}.*']),
     package_data={
         package_name: [
-            *('py.typed', 'export/templates/*.*', 'report/templates/*.html', 'schemas/*.json')
+            *('py.typed', 'export/templates/*.*', 'report/templates/*.html', 'schemas/*.json'),
+            *('effects/c/*.c', 'operators/c/*.c'),
         ]
     },
     data_files=[

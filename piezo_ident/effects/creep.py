@@ -14,7 +14,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.trials import ladder
-from piezo_ident.operators.c_code import CCode
+from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
 
 #: time after a step up to which motion may belong to the dynamics [s]
@@ -155,22 +155,5 @@ class Creep(Effect):
         n = self._c.size
         if n == 0:
             return CCode()
-        return CCode(
-            {'n': n, 'gain': self._c, 'share': self._share, 'rest': 1.0 + self._c.sum()},
-            f'double h[{n}];\n',
-            """
-        int i;
-        for (i = 0; i < n; i++)
-            s->h[i] = x;
-        x *= rest;
-        """,
-            """
-        double w = 0.0;
-        int i;
-        for (i = 0; i < n; i++) {
-            s->h[i] = piezo_alive(s->h[i] + share[i] * (x - s->h[i]));
-            w += gain[i] * s->h[i];
-        }
-        x += w;
-        """,
-        )
+        numbers: Numbers = {'n': n, 'gain': self._c, 'share': self._share}
+        return read_c(__package__, 'creep', {**numbers, 'rest': 1.0 + self._c.sum()})

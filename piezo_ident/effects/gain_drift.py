@@ -13,7 +13,7 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import ordered_kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.c_code import CCode
+from piezo_ident.operators.c_code import CCode, read_c
 from piezo_ident.operators.chain import Block
 
 
@@ -127,20 +127,4 @@ class GainDrift(Effect):
         time, gain = self.array('time'), self.array('gain')
         if not gain.any():
             return CCode()
-        return CCode(
-            {'n': gain.size, 'knot': time, 'gain': gain},
-            rest='x *= 1.0 + gain[0];\n',
-            step="""
-        int i = 0;
-        double g = gain[n - 1];
-        if (t < knot[n - 1]) {
-            g = gain[0];
-            if (t > knot[0]) {
-                while (t >= knot[i + 1])
-                    i++;
-                g = (gain[i + 1] - gain[i]) / (knot[i + 1] - knot[i]) * (t - knot[i]) + gain[i];
-            }
-        }
-        x *= 1.0 + g;
-        """,
-        )
+        return read_c(__package__, 'gain_drift', {'n': gain.size, 'knot': time, 'gain': gain})

@@ -12,7 +12,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.c_code import CCode, Numbers
+from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.kernels import held
@@ -120,22 +120,9 @@ class NoncongruentMinorLoops(Effect):
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
-        n = self._r.size
-        more = """
-        double w = 0.0, bent = 0.0;
-        int i;
-        for (i = 0; i < n; i++) {
-            const double f = piezo_held(s->f[i], u - r[i], u);
-            s->f[i] = f;
-            w += slope[i] * f;
-            bent += bend[i] * f * f;
-        }
-        x += (u - bias) * w + bent;
-        """
-        start = 'int j;\nfor (j = 0; j < n; j++)\n    s->f[j] = piezo_held(0.0, u - r[j], u);\n'
-        numbers: Numbers = {'n': n, 'r': self._r, 'slope': self._slope, 'bend': self._bend}
-        numbers['bias'] = self.number('bias')
-        return CCode(numbers, f'double f[{n}];\n', f'{start}{{{more}}}\n', more)
+        numbers: Numbers = {'n': self._r.size, 'r': self._r, 'slope': self._slope}
+        numbers |= {'bend': self._bend, 'bias': self.number('bias')}
+        return read_c(__package__, self.name, numbers)
 
     def _more(self, x: Array) -> Array:
         out: Array = _tilted(

@@ -18,7 +18,7 @@ from piezo_ident.effects.moving_plays import (
     moved_plays_apart,
     speed_of,
 )
-from piezo_ident.operators.c_code import CCode, Numbers
+from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator, LANES
 from piezo_ident.operators.parts import (
@@ -191,50 +191,10 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = h.for_kernel
         numbers |= {'m': m, 'r': r[:m], 'q': q[:m], 'low': low, 'pole': self.pole}
         numbers |= {'per_second': self.sample_rate}
-        weight, bent = 'q[i]', ''
         if c.size:
             rows = ('c1', 'c2', 'c3', 'kappa', 'width')
             numbers |= {name: row[:m] for name, row in zip(rows, c, strict=True)}
-            weight = '(q[i] + kappa[i] * (u - low))'
-            curve = 'piezo_curve(c1[i], c2[i], c3[i], width[i], {} - low)'
-            bent = f' + {curve.format("f")} - {curve.format("g")}'
-        level = 'power /= 1.0 + levelling * power; ' if self.number('levelling') > 0.0 else ''
-        level += 'power = pow(power, exponent);' if self.number('exponent') != 1.0 else ''
-        # terms with a zero coefficient are left out
-        half = 'r[i] * (1.0 + stretch * power)' if self.number('stretch') else 'r[i]'
-        half += ' + gain * power' if self.number('gain') else ''
-        top = 'u + r[i] * (lead_stretch * power)' if self.number('lead_stretch') else 'u'
-        top += ' + lead * power' if self.number('lead') else ''
-        return CCode(
-            numbers,
-            f'double wide[{m}], still[{m}], last, speed;\n',
-            """
-        int i;
-        for (i = 0; i < m; i++)
-            s->wide[i] = s->still[i] = piezo_held(0.0, u - r[i], u);
-        s->last = u;
-        s->speed = 0.0;
-        """,
-            f"""
-        double power, w = 0.0;
-        int i;
-        s->speed = piezo_alive(pole * s->speed + (1.0 - pole) * (u - s->last) * per_second);
-        s->last = u;
-        power = fabs(s->speed);
-        {level}
-        for (i = 0; i < m; i++) {{
-            const double g = piezo_held(s->still[i], u - r[i], u);
-            const double half = {half};
-            const double bottom = u - (half > 0.0 ? half : 0.0);
-            const double top = {top};
-            const double f = piezo_held(s->wide[i], bottom, top < bottom ? bottom : top);
-            s->still[i] = g;
-            s->wide[i] = f;
-            w += {weight} * (f - g){bent};
-        }}
-        x += w;
-        """,
-        )
+        return read_c(__package__, self.name, numbers, has_curves=c.size > 0)
 
     def power(self, v: Array, v0: float) -> Array:
         """Compute ``|s|^eps`` for an input from rest at v0, both shapes (n,)."""

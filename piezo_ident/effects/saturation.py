@@ -13,13 +13,11 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, View
-from piezo_ident.operators.c_code import CCode
+from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
 
 #: beyond this many knees from an end, the rounding of the knee is below the precision of a float
 FAR = 40.0
-#: L(z) in C
-_SMOOTH = 'z < 0.0 ? log1p(exp(z)) : z + log1p(exp(-z))'
 
 
 @kernel
@@ -101,23 +99,9 @@ class Saturation(Effect):
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
-        ends = {name: self.number(name) for name in ('low', 'high')}
-        knee = self.number('knee')
-        if knee == 0.0:
-            sharp = {'low': 'x = x < low ? low : x;\n', 'high': 'x = x > high ? high : x;\n'}
-            step = ''.join(sharp[name] for name, end in ends.items() if np.isfinite(end))
-            return CCode({**ends}, rest=step, step=step)
-        step = 'double y = x, z;\n'
-        # as in `_soften`, the upper end first
-        if np.isfinite(ends['high']):
-            step += 'z = (x - high) / knee;\nif (z > knees)\n    y = high;\n'
-            step += f'else if (z > -knees)\n    y = x - knee * ({_SMOOTH});\n'
-        if np.isfinite(ends['low']):
-            step += 'z = (low - x) / knee;\nif (z > knees)\n    y += low - x;\n'
-            step += f'else if (z > -knees)\n    y += knee * ({_SMOOTH});\n'
-        step += 'x = y;\n'
-        step = step if np.isfinite([*ends.values()]).any() else ''
-        return CCode({**ends, 'knee': knee, 'knees': FAR}, rest=step, step=step)
+        numbers: Numbers = {name: self.number(name) for name in ('low', 'high', 'knee')}
+        finite = {f'has_{name}': np.isfinite(self.number(name)) for name in ('low', 'high')}
+        return read_c(__package__, self.name, {**numbers, 'knees': FAR}, **finite)
 
     def _limited(self, x: Array) -> Array:
         low, high, knee = (self.number(name) for name in ('low', 'high', 'knee'))

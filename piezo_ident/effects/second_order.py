@@ -11,7 +11,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import alive, kernel
-from piezo_ident.operators.c_code import CCode
+from piezo_ident.operators.c_code import CCode, Numbers, read_c
 
 
 @kernel
@@ -107,32 +107,7 @@ class SecondOrderSection:
 
 def sections_in_c(sections: Sequence[SecondOrderSection], signal: str) -> CCode:
     """Write C code that adds the sections of a signal, given by its name in C, to x."""
-    n = len(sections)
-    rows = zip(
-        ('n0', 'n1', 'a1', 'a2'), np.array([z.coefficients for z in sections]).T, strict=True
-    )
-    return CCode(
-        {'n': n, **dict(rows)},
-        f'double before, s0[{n}], s1[{n}];\n',
-        f"""
-{{
-    int i;
-    s->before = {signal};
-    for (i = 0; i < n; i++)
-        s->s0[i] = s->s1[i] = 0.0;
-}}
-""",
-        f"""
-{{
-    const double d = {signal} - s->before;
-    int i;
-    s->before = {signal};
-    for (i = 0; i < n; i++) {{
-        const double y = n0[i] * d + s->s0[i];
-        s->s0[i] = piezo_alive(n1[i] * d - a1[i] * y + s->s1[i]);
-        s->s1[i] = -a2[i] * y;
-        x += y;
-    }}
-}}
-""",
-    )
+    names = 'n0', 'n1', 'a1', 'a2'
+    rows = np.array([z.coefficients for z in sections]).T
+    numbers: Numbers = {'n': len(sections), **dict(zip(names, rows, strict=True))}
+    return read_c(__package__, 'second_order', numbers, signal=signal)

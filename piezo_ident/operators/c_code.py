@@ -12,6 +12,7 @@ of a sum only changes the last digit: a G that would amplify the change runs as 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -21,6 +22,7 @@ from piezo_ident.operators.kernels import path_lines
 
 #: constants of an operator, by name
 Numbers = dict[str, float | int | Array]
+_HERE = 'piezo_ident.operators'
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,64 +48,32 @@ class CCode:
     channel: str = ''
 
 
-_PLAYS = """
-int i;
-double w = 0.0;
-for (i = 0; i < m; i++) {
-    s->f[i] = piezo_held(s->f[i], x - r[i], x);
-    w += q[i] * s->f[i];
-}
-"""
-_WIDE = """
-for (i = 0; i < m; i++)
-    w += kappa[i] * (x - low) * (s->f[i] - low)
-        + piezo_curve(c1[i], c2[i], c3[i], width[i], s->f[i] - low);
-"""
-_PLAYS_AT_REST = """
-{
-    int i;
-    for (i = 0; i < m; i++)
-        s->f[i] = piezo_held(0.0, x - r[i], x);
-}
-"""
-# `lags` becomes the sum of the lags after the voltage went to `to`
-_LAGS = """
-{
-    const double length = fabs(to - s->last);
-    const double *const line = lines + (to > s->last ? 3 * n : 0);
-    double left = 0.0;
-    int j;
+def read_c(package: str, name: str, numbers: Numbers, channel: str = '', **options: Any) -> CCode:
+    """
+    Fill the file ``c/NAME.c`` of a package with numbers and options.
 
-    lags = 0.0;
-    for (j = 0; j < n; j++) {
-        if (length > 0.0) {
-            const double e0 = line[j], e1 = line[n + j], e2 = line[2 * n + j];
-            const double now = e0 + to * (e1 + to * (e2 + to * d3[j]));
-            const double was = e0 + s->last * (e1 + s->last * (e2 + s->last * d3[j]));
-            left = j > 0 && rate[j] == 2.0 * rate[j - 1] ? left * left : exp(-rate[j] * length);
-            s->z[j] = now + (s->z[j] - was) * left;
-        }
-        lags += s->z[j] - to * (d1[j] + to * (d2[j] + to * d3[j]));
-    }
-    s->last = to;
-}
-"""
-_LAGS_AT_REST = """
-{
-    const double way[5] = {high, low, high, low, x};
-    double lags;
-    int i;
+    The file is a template of Jinja.  The lines below ``// state``, ``// rest`` and ``// step`` are
+    the parts of the code.  Other comments stay in the file.
+    """
+    # only an export needs the templates
+    import jinja2
 
-    for (i = 0; i < n; i++)
-        s->z[i] = low * (d1[i] + low * (d2[i] + low * d3[i]));
-    s->last = low;
-    for (i = 0; i < 5; i++) {
-        const double to = way[i];
-        LAGS
-    }
-    (void)lags;
-}
-"""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader(package, 'c'),
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    text = environment.get_template(f'{name}.c').render({**numbers, **options})
+    parts = {'': '', 'state': '', 'rest': '', 'step': ''}
+    part = ''
+    for line in text.splitlines():
+        if line.startswith('// ') and line[3:] in parts:
+            part = line[3:]
+        elif line.strip() and not line.lstrip().startswith('//'):
+            parts[part] += f'{line}\n'
+    return CCode(numbers, parts['state'], parts['rest'], parts['step'], channel)
 
 
 def hysteresis_in_c(h: Hysteresis) -> CCode:
@@ -112,125 +82,38 @@ def hysteresis_in_c(h: Hysteresis) -> CCode:
     r, q, p1, p2, p0, low, c = h.for_kernel
     numbers: Numbers = {'p0': p0, 'p1': p1, 'p2': p2}
     numbers |= {'low': low, 'high': h.span[1]}
-    state, rest, step = '', '', 'double w = 0.0;\n'
     if m:
         numbers |= {'m': m, 'r': r[:m], 'q': q[:m]}
-        state, rest, step = f'double f[{m}];\n', _PLAYS_AT_REST, _PLAYS
     if c.size:
         names = ('c1', 'c2', 'c3', 'kappa', 'width')
         numbers |= {name: row[:m] for name, row in zip(names, c, strict=True)}
-        step += _WIDE
-    if h.relaxations is not None and len(h.relaxations):
+    has_lags = h.relaxations is not None and len(h.relaxations) > 0
+    if h.relaxations is not None and has_lags:
         n = len(h.relaxations)
         # these names differ from the names of the curves
         rows = zip(('rate', 'd1', 'd2', 'd3'), h.relaxations.T, strict=True)
         numbers |= {'n': n, 'lines': path_lines(np.array(h.relaxations)).ravel(), **dict(rows)}
-        state += f'double z[{n}];\ndouble last;\n'
-        rest += _LAGS_AT_REST.replace('LAGS', _LAGS)
-        step += f'{{\nconst double to = x;\ndouble lags;\n{_LAGS}\nw += lags;\n}}\n'
-    step += 'x = w + ((p1 * x + p0) * x + p2) * x;\n'
-    # at rest, H has processed its voltage once
-    return CCode(numbers, state, f'{rest}{{\n{step}}}\n', step)
-
-
-# two sums run side by side, and neither waits for the other
-_G = """
-const double *past;
-double y = 0.0, other = 0.0;
-int i;
-
-s->w[s->at_w] = s->w[s->at_w + nb] = x;
-s->at_w = s->at_w + 1 < nb ? s->at_w + 1 : 0;
-past = s->w + s->at_w;
-
-for (i = nb % 2; i < nb; i += 2) {
-    other += b[i] * past[i];
-    y += b[i + 1] * past[i + 1];
-}
-if (nb % 2)
-    y += b[0] * past[0];
-"""
-_G_BACK = """
-past = s->y + s->at_y;
-for (i = na % 2; i < na; i += 2) {
-    other -= a[i] * past[i];
-    y -= a[i + 1] * past[i + 1];
-}
-
-if (na % 2)
-    other -= a[0] * past[0];
-y = piezo_alive(y + other);
-s->y[s->at_y] = s->y[s->at_y + na] = y;
-s->at_y = s->at_y + 1 < na ? s->at_y + 1 : 0;
-"""
-_G_AT_REST = """
-{
-    int i;
-    s->at_w = 0;
-    for (i = 0; i < 2 * nb; i++)
-        s->w[i] = x;
-}
-x *= gain;
-"""
-_G_BACK_AT_REST = """
-{
-    int i;
-    s->at_y = 0;
-    for (i = 0; i < 2 * na; i++)
-        s->y[i] = x;
-}
-"""
-_SECTIONS = """
-double (*z)[2] = s->z;
-const double *g = sections;
-int i;
-
-for (i = 0; i < n; i++, g += 5) {
-    const double y = g[0] * x + z[i][0];
-    z[i][0] = piezo_alive((g[1] * x + z[i][1]) - g[3] * y);
-    z[i][1] = piezo_alive(g[2] * x - g[4] * y);
-    x = y;
-}
-"""
-_SECTIONS_AT_REST = """
-{
-    const double *g = sections;
-    int i;
-    for (i = 0; i < n; i++, g += 5) {
-        const double y = x * (g[0] + g[1] + g[2]) / (1.0 + g[3] + g[4]);
-        s->z[i][0] = y - g[0] * x;
-        s->z[i][1] = g[2] * x - g[4] * y;
-        x = y;
-    }
-}
-"""
+    return read_c(
+        _HERE,
+        'hysteresis',
+        numbers,
+        has_plays=m > 0,
+        has_curves=c.size > 0,
+        has_lags=has_lags,
+    )
 
 
 def dynamics_in_c(g: Dynamics) -> CCode:
     """Write G in C, as `dynamics` or `run_sections` computes it."""
     if g.sections is not None:
-        n = len(g.sections)
-        numbers: Numbers = {'n': n, 'sections': g.sections.ravel()}
-        return CCode(numbers, f'double z[{n}][2];\n', _SECTIONS_AT_REST, _SECTIONS)
-    na, nb = g.a.size, g.b.size
-    numbers = {'nb': nb, 'b': g.b[::-1], 'na': na, 'a': g.a[::-1], 'gain': g.gain}
-    # every sample is stored twice, so that the past is always contiguous
-    state = f'double w[{2 * nb}];\nint at_w;\n'
-    if not na:
-        return CCode(numbers, state, _G_AT_REST, f'{_G}x = y + other;\n')
-    state += f'double y[{2 * na}];\nint at_y;\n'
-    return CCode(numbers, state, _G_AT_REST + _G_BACK_AT_REST, f'{_G}{_G_BACK}x = y;\n')
+        return read_c(_HERE, 'sections', {'n': len(g.sections), 'sections': g.sections.ravel()})
+    numbers: Numbers = {'nb': g.b.size, 'b': g.b[::-1], 'na': g.a.size, 'a': g.a[::-1]}
+    return read_c(_HERE, 'dynamics', {**numbers, 'gain': g.gain})
 
 
 def delay_in_c(delay: Delay) -> CCode:
     """Write z^-d in C, as `DelayOperator` computes it."""
     if delay.total == 0.0:
         return CCode()
-    between = delay.fraction > 0.0
-    n = delay.samples + (2 if between else 1)
-    state = f'double line[{n}];\nint at;\n'
-    rest = '{\nint i;\ns->at = 0;\nfor (i = 0; i < n; i++)\n    s->line[i] = x;\n}\n'
-    step = 's->line[s->at] = x;\ns->at = s->at + 1 < n ? s->at + 1 : 0;\n'
-    now = '(1.0 - part) * s->line[s->at + 1 < n ? s->at + 1 : 0] + part * s->line[s->at]'
-    step += f'x = {now if between else "s->line[s->at]"};\n'
-    return CCode({'n': n, 'part': delay.fraction}, state, rest, step)
+    n = delay.samples + (2 if delay.fraction > 0.0 else 1)
+    return read_c(_HERE, 'delay', {'n': n, 'part': delay.fraction})
