@@ -94,8 +94,8 @@ class Corrector:
     ----------
     horizon : int, optional
         [samples]
-    gain : bool, optional
-        Whether the gain is followed, too.
+    gain, drift : bool, optional
+        Whether the gain is followed, too, and whether as one that drifts.
     rate : float, optional
         Corrections published per second of the stream.
     adapt : {'off', 'gain', 'hysteresis'}, optional
@@ -109,9 +109,15 @@ class Corrector:
     """
 
     def __init__(
-        self, horizon: int = HORIZON, gain: bool = False, rate: float = RATE, adapt: Learns = 'off'
+        self,
+        horizon: int = HORIZON,
+        gain: bool = False,
+        drift: bool = False,
+        adapt: Learns = 'off',
+        rate: float = RATE,
     ) -> None:
-        self._horizon, self._gain, self._rate, self._adapt = horizon, gain, rate, adapt
+        self._horizon, self._gain, self._drift, self._adapt = horizon, gain, drift, adapt
+        self._rate = rate
         self._model: StageModel | None = None
         self._adaptation: Adaptation | None = None
         self._attribution: Attribution | None = None
@@ -142,10 +148,15 @@ class Corrector:
         self._learn_anew(recalled)
 
     def set_up(
-        self, horizon: int, gain: bool, adapt: Learns, recalled: Recalled = StageModel.stream
+        self,
+        horizon: int,
+        gain: bool,
+        drift: bool,
+        adapt: Learns,
+        recalled: Recalled = StageModel.stream,
     ) -> None:
-        """Change the horizon, whether the gain is followed, and the learnt part; begin anew."""
-        self._horizon, self._gain, self._adapt = horizon, gain, adapt
+        """Change the settings, see `Corrector`, and begin anew."""
+        self._horizon, self._gain, self._drift, self._adapt = horizon, gain, drift, adapt
         self._learn_anew(recalled)
 
     def _learn_anew(self, recalled: Recalled) -> None:
@@ -249,7 +260,9 @@ class Corrector:
                 if self._adaptation is not None:
                     self._adaptation.begin()
             self._is_new = False
-            self._observer = Observer(model, horizon=self._horizon, known=known, gain=self._gain)
+            self._observer = Observer(
+                model, horizon=self._horizon, known=known, gain=self._gain, drift=self._drift
+            )
         elif kind is Kind.GAP and self._last is not None:
             # the predictor bridged this gap by a straight line, too
             ends = zip(self._last, (float(v[0]), float(prediction.values[0])), strict=True)
@@ -315,7 +328,7 @@ class Corrector:
 
     def _tell(self, t: Array, seen: Observed) -> list[dict[str, float]]:
         """Pick the corrections to publish, `rate` times a second of the stream."""
-        names = CORRECTIONS | (GAIN if self._gain else {})
+        names = CORRECTIONS | (GAIN if self._gain or self._drift else {})
         # rounding may put a sample just before its stretch
         bins = np.floor(t * self._rate + 1e-6).astype(np.int64)
         first = np.flatnonzero(np.diff(bins, prepend=self._bin)).tolist()

@@ -24,6 +24,10 @@ variance that time adds to gamma therefore counts along the path only; at rest g
 same.  The filter refuses a step of the gain at first, as it refuses every step.  The step is
 accepted once the voltage has moved and the refused measurements are proportional to x.
 
+The drift of the gain is followed on request, too: gamma then also grows by delta a second, and
+delta is a random walk that returns to zero.  A ramp of the gain leaves no lag then.  Without a
+sensor, however, the estimate soon errs more: an unknown drift goes on.
+
 Two hypotheses run side by side, weighted by their likelihood: the zero is unchanged, or it is
 anywhere.  Slow creep and a shifted zero look alike at first.  A wide prior of the zero alone would
 take all creep for a shift.
@@ -74,8 +78,10 @@ ZEROS = (1e-3, 1.0)
 GAIN_WALK = 1e-3 / np.sqrt(60.0)
 #: rms change of the gain since identification (taste: some ten kelvin and lost poling)
 GAIN_SIZE = 0.1
-#: time constant with which old gains fade from the drift of the gain [s] (taste)
+#: time constant with which old gains fade from the drift of the gain, and a drift ends [s] (taste)
 DRIFT_TIME = 10.0
+#: rms drift of the gain [1/s], if it is followed: it then makes the rms change of the gain
+DRIFT_SIZE = GAIN_SIZE / DRIFT_TIME
 #: measurements in a row that make a step, and their spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
 #: largest and smallest slope of refused measurements over the free run that make a changed sign;
@@ -108,7 +114,8 @@ class Observed:
     gain, gain_std : ndarray
         Relative change of the gain, and its standard deviation; zero if it is not followed.
     drift, drift_std : ndarray
-        Change of the gain in a second over the last `DRIFT_TIME`, and its standard deviation.
+        Change of the gain in a second, and its standard deviation: if the drift is not followed,
+        over the last `DRIFT_TIME`.
     band : ndarray
         Largest further change of the offset by plays of unknown output.
     fading : ndarray, shape (c,)
@@ -150,8 +157,8 @@ class Observer:
     known : bool, optional
         Whether the free run begins with known outputs of the plays.  A start at the lowest voltage
         always does.
-    gain : bool, optional
-        Whether the gain is followed, too.
+    gain, drift : bool, optional
+        Whether the gain is followed, too, and whether as one that drifts.
     """
 
     def __init__(
@@ -165,6 +172,7 @@ class Observer:
         gate: float = GATE,
         known: bool = False,
         gain: bool = False,
+        drift: bool = False,
     ) -> None:
         if horizon < 1:
             raise DataError(f'observer: the horizon is at least one sample, got {horizon}')
@@ -175,7 +183,7 @@ class Observer:
         noisy = size if noise is None else max(noise / span, LEAST)
         self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
         self._group = max(1, round(GROUP * model.sample_rate))
-        self._gain = gain
+        self._gain, self._drift = gain or drift, drift
         self._law, self._row = self._laws(size, noisy, gate)
         low, high = model.scaling.u(model.scaling.range).tolist()
         self._low, self._width = low, high - low
@@ -198,13 +206,14 @@ class Observer:
         numbers = [noise**2, error**2, PATH, walk, gate**2, growth, groups, reach**2]
         numbers += [GAIN_WALK**2 * size / rate, GAIN_SIZE**2]
         numbers += [size / rate, max(2.0, DRIFT_TIME * rate / size)]
-        own = int(self._gain)
-        # the entry of the gain is set for each group
-        row = np.concatenate([[1.0], gains * before.mean(axis=1), np.zeros(own), [1.0]])
+        numbers.append(self._drift * DRIFT_SIZE**2)
+        # drift and gain; the entry of the gain is set for each group
+        own = np.array([np.exp(-size / rate / DRIFT_TIME)] * self._drift + [1.0] * self._gain)
+        row = np.concatenate([[1.0], gains * before.mean(axis=1), 0.0 * own, [1.0]])
         law = kernel.Law(
             lead=gains * left**self.horizon,
             left=left,
-            kept=np.concatenate([[1.0], left**size, np.ones(own)]),
+            kept=np.concatenate([[1.0], left**size, own]),
             numbers=np.array(numbers),
         )
         return law, row
@@ -218,6 +227,8 @@ class Observer:
             P[b] = np.diag(
                 [zero**2, *[reach2] * c, *[0.0] * (n - 2 - c), law.numbers[kernel.ERROR]]
             )
+            if self._drift:
+                P[b, -3, -3] = law.numbers[kernel.DRIFT_VAR]
         now = np.zeros(kernel.PLACES)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
         now[kernel.IDLE] = self._gain * law.numbers[kernel.GAIN_SIZE]

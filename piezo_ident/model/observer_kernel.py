@@ -39,10 +39,13 @@ SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE = range(23, 29)
 # fading sums over groups, for the drift of the gain g: number, weights w, w t, w t^2, w g, w t g;
 # t is zero now.  Behind them the drift and its standard deviation
 GROUPS, SUM_W, SUM_T, SUM_TT, SUM_G, SUM_TG, DRIFT, DRIFT_STD = range(29, 37)
-# whether the free run has moved since the reading changed last
-STUCK_NOW, PLACES = range(37, 39)
-# places in `Law.numbers`; STEP is the time of a group [s], FADE that of the fading sums [groups]
+# whether the free run has moved since the reading changed last; WAITING, time whose drift of the
+# gain waits for motion [s]
+STUCK_NOW, WAITING, PLACES = range(37, 40)
+# places in `Law.numbers`; STEP is the time of a group [s], FADE that of the fading sums [groups],
+# DRIFT_VAR the variance of the drift of the gain, zero if it is not followed
 NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE, STEP, FADE = range(12)
+DRIFT_VAR = 12
 
 
 class Law(NamedTuple):
@@ -89,8 +92,20 @@ def _typical(group: Array, noise: float) -> tuple[float, float, int]:
 
 @ordered_kernel
 def _has_gain(law: Law, s: State) -> bool:
-    # the states are offset, creep, the gain if it is followed, and m
+    # the states are offset, creep, the gain behind its drift if they are followed, and m
     return s.row.size > law.lead.size + 2
+
+
+@ordered_kernel
+def _let_gain_drift(law: Law, s: State, moved: float) -> None:
+    # time makes the gain drift, and this counts along the path only, as the variance of the gain
+    now, d = s.now, s.row.size - 3
+    now[WAITING] += law.numbers[STEP]
+    dt, now[WAITING] = moved * now[WAITING], (1.0 - moved) * now[WAITING]
+    for b in range(s.weight.size):
+        s.x[b, d + 1] += dt * s.x[b, d]
+        s.P[b, d + 1] += dt * s.P[b, d]
+        s.P[b, :, d + 1] += dt * s.P[b, :, d]
 
 
 @ordered_kernel
@@ -98,6 +113,8 @@ def _let_time_pass(law: Law, s: State) -> None:
     numbers, now = law.numbers, s.now
     hypotheses, n = s.x.shape
     phi = np.exp(-now[PATH] / numbers[LENGTH])
+    if numbers[DRIFT_VAR] > 0.0:
+        _let_gain_drift(law, s, 1.0 - phi * phi)
     for b in range(hypotheses):
         for i in range(n):
             one = law.kept[i] if i < n - 1 else phi
@@ -107,6 +124,8 @@ def _let_time_pass(law: Law, s: State) -> None:
         # unknown plays have moved the offset by up to the shrinking of their band, equally likely
         s.P[b, 0, 0] += numbers[WALK] + (now[MOVED] ** 2 - now[SPREAD] ** 2) / 3.0
         s.P[b, n - 1, n - 1] += now[SCALE] * numbers[ERROR] * (1.0 - phi * phi)
+        if numbers[DRIFT_VAR] > 0.0:
+            s.P[b, n - 3, n - 3] += numbers[DRIFT_VAR] * (1.0 - law.kept[n - 3] ** 2)
     if _has_gain(law, s):
         # time makes the gain less certain, and this variance counts along the path only
         share = 1.0 - phi ** (1.0 / STROKES)
@@ -240,7 +259,7 @@ def tell(law: Law, s: State) -> None:
     share = np.exp(s.weight)
     share /= share.sum()
     offset, squares, creep, creeps, whole = 0.0, 0.0, 0.0, 0.0, 0.0
-    gain, gains, crossed = 0.0, 0.0, 0.0
+    gain, gains, crossed, drift, drifts = 0.0, 0.0, 0.0, 0.0, 0.0
     s.coming[:] = 0.0
     for b in range(share.size):
         a, z, var, cross = s.x[b, 0], 0.0, 0.0, 0.0
@@ -258,6 +277,9 @@ def tell(law: Law, s: State) -> None:
             gain += share[b] * g
             gains += share[b] * (s.P[b, -2, -2] + g * g)
             crossed += share[b] * (with_gain + (a + z) * g)
+        if law.numbers[DRIFT_VAR] > 0.0:
+            drift += share[b] * s.x[b, -3]
+            drifts += share[b] * (s.P[b, -3, -3] + s.x[b, -3] ** 2)
         offset += share[b] * a
         creep += share[b] * z
         squares += share[b] * (s.P[b, 0, 0] + a * a)
@@ -267,6 +289,8 @@ def tell(law: Law, s: State) -> None:
     now[CREEP], now[CREEP_VAR] = creep, max(creeps - creep * creep, 0.0)
     now[GAIN], now[GAIN_VAR] = gain, max(gains - gain * gain, 0.0)
     now[CROSS] = crossed - (offset + creep) * gain
+    if law.numbers[DRIFT_VAR] > 0.0:
+        now[DRIFT], now[DRIFT_STD] = drift, np.sqrt(max(drifts - drift * drift, 0.0))
     now[VAR] = max(whole - (offset + creep) ** 2, 0.0)
     now[VAR] += max(now[SCALE] * law.numbers[ERROR], now[MISFIT])
 
@@ -318,7 +342,7 @@ def _end_group(law: Law, s: State) -> None:
         _measure(law, s, mean, count)
         now[MOVED] = now[SPREAD] = 0.0
     tell(law, s)
-    if _has_gain(law, s):
+    if _has_gain(law, s) and law.numbers[DRIFT_VAR] == 0.0:
         _follow_drift(law, s)
 
 

@@ -31,6 +31,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
+#: settings of the observer
+OBSERVED = ('horizon', 'observe_gain', 'observe_drift', 'adapt')
 #: time for which a problem of the stream stays in the status [s], and most problems there
 REMEMBER, MOST = 5.0, 4
 #: longest wait of a block for the voltage of a further axis, and period of a look [s]
@@ -83,7 +85,7 @@ class ModelNode(LabNode):
         self._report_state()
 
     def _comparison(self, tail: str) -> AxisComparison:
-        values = [self.values[n] for n in ('horizon', 'observe_gain', 'preview_rate', 'adapt')]
+        values = [self.values[name] for name in (*OBSERVED, 'preview_rate')]
         return AxisComparison(
             self.values['window'],
             Corrector(*values),
@@ -118,11 +120,11 @@ class ModelNode(LabNode):
         if 'window' in changed:
             for one in self._comparisons.values():
                 one.set_window(changed['window'])
-        if {'horizon', 'observe_gain', 'adapt'} & set(changed):
+        if {*OBSERVED} & set(changed):
             new = {**self.values, **changed}
-            h, gain, adapt = (new[name] for name in ('horizon', 'observe_gain', 'adapt'))
+            horizon, gain, drift, adapt = (new[name] for name in OBSERVED)
             for k, one in enumerate(self._comparisons.values()):
-                one.corrector.set_up(h, gain, adapt, self._recalled(k))
+                one.corrector.set_up(horizon, gain, drift, adapt, self._recalled(k))
                 one.left.clear()
 
     def _recalled(self, axis: int) -> Recalled:

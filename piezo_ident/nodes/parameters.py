@@ -225,6 +225,7 @@ MODEL = (
         100_000,
     ),
     Declaration('observe_gain', False, 'whether the estimate follows the gain of the stage, too'),
+    Declaration('observe_drift', False, 'the same for a gain that drifts'),
     Declaration(
         'adapt',
         'off',

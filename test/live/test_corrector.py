@@ -258,7 +258,7 @@ def test_a_model_that_comes_later_learns_as_one_from_the_start():
         line.corrector.set_model(model)
         for k in range(0, N, 100):
             if late and k == 2000:
-                line.corrector.set_up(100, False, 'hysteresis', line.predictor.caught_up)
+                line.corrector.set_up(100, False, False, 'hysteresis', line.predictor.caught_up)
                 line.got.clear()
             cut = slice(k, k + 100)
             line.voltage(cut)

@@ -14,6 +14,8 @@ from piezo_ident.model.initial_memory import creep_elements
 from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.observer import (
     BEYOND,
+    DRIFT_SIZE,
+    DRIFT_TIME,
     GAIN_SIZE,
     GAIN_WALK,
     observe,
@@ -70,24 +72,27 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
-def textbook(model, v, y, noise, error, horizon, gain=False):
+def textbook(model, v, y, noise, error, horizon, gain=False, drift=False):
     """Return the correction by a Kalman filter with full matrices, sample after sample."""
     gains, times = creep_elements(model)
-    n, idle = 2 + gains.size + gain, GAIN_SIZE**2
+    n, idle, waiting = 2 + gains.size + gain + drift, GAIN_SIZE**2, 0.0
+    kept = np.exp(-1.0 / (model.sample_rate * DRIFT_TIME))
     a = np.exp(-1.0 / (model.sample_rate * times))
     u = model.scaling.u(v)
     free = model.scaling.x(model.stream().process(v))
     e = model.scaling.x(y) - free
     path = np.abs(np.diff(u, prepend=u[0]))
     reach = BEYOND * np.ptp(model.hysteresis(np.linspace(0.0, 1.0, 65)))
-    own = [0.0] * gain
+    own = [DRIFT_SIZE**2] * drift + [0.0] * gain
     x, P = np.zeros(n), np.diag([ZEROS[1] ** 2, *[reach**2] * gains.size, *own, error**2])
     out = np.zeros(v.size)
     for k in range(v.size - horizon):
         phi = np.exp(-path[k] / PATH)
-        F = np.diag([1.0, *a, *[1.0] * gain, phi])
-        H = np.array([[1.0, *gains, *[free[k]] * gain, 1.0]])
-        ahead = np.array([1.0, *gains * a**horizon, *[free[k + horizon]] * gain, 0.0])
+        F = np.diag([1.0, *a, *[kept] * drift, *[1.0] * gain, phi])
+        H = np.array([[1.0, *gains, *[0.0] * drift, *[free[k]] * gain, 1.0]])
+        ahead = np.array(
+            [1.0, *gains * a**horizon, *[0.0] * drift, *[free[k + horizon]] * gain, 0.0]
+        )
         Q = np.zeros((n, n))
         Q[0, 0], Q[-1, -1] = WALK**2 / model.sample_rate, error**2 * (1.0 - phi**2)
         if gain:
@@ -95,6 +100,10 @@ def textbook(model, v, y, noise, error, horizon, gain=False):
             idle = min(idle + GAIN_WALK**2 / model.sample_rate, GAIN_SIZE**2)
             Q[-2, -2] = idle * (1.0 - phi**2)
             idle *= phi**2
+        if drift:
+            waiting += 1.0 / model.sample_rate
+            F[-2, -3], waiting = waiting * (1.0 - phi**2), waiting * phi**2
+            Q[-3, -3] = DRIFT_SIZE**2 * (1.0 - kept**2)
         x, P = F @ x, F @ P @ F.T + Q
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + noise**2)
         x, P = x + K @ (e[k] - H @ x), (np.eye(n) - K @ H) @ P
@@ -102,15 +111,16 @@ def textbook(model, v, y, noise, error, horizon, gain=False):
     return out
 
 
-@pytest.mark.parametrize('gain', [False, True])
-def test_the_linear_case_is_the_kalman_filter_of_the_textbook(gain):
+@pytest.mark.parametrize(('gain', 'drift'), [(False, False), (True, False), (True, True)])
+def test_the_linear_case_is_the_kalman_filter_of_the_textbook(gain, drift):
     model, n, horizon = creeping(), 3000, 7
     v = moved(n)
     start = Start(creep=np.array([0.4, -0.2, 0.3, 0.1]))
     y = with_noise((1.0 + 0.02 * gain) * model.simulate(v, start=start), 1e-8)
-    options = {'error': 75e-9, 'noise': 1e-8, 'zeros': (SPAN,), 'gate': np.inf, 'gain': gain}
+    options = {'error': 75e-9, 'noise': 1e-8, 'zeros': (SPAN,), 'gate': np.inf}
+    options |= {'gain': gain, 'drift': drift}
     seen = observe(model, Piece(v, y, SLOW_RATE), horizon, **options)
-    expected = textbook(model, v, y, 1e-8 / SPAN, 1e-3, horizon, gain)
+    expected = textbook(model, v, y, 1e-8 / SPAN, 1e-3, horizon, gain, drift)
     found = (seen.estimate - model.simulate(v)) / SPAN
     assert_allclose(found, expected, rtol=0, atol=1e-10)
     assert np.ptp(expected) > 1e-3
@@ -371,6 +381,45 @@ def test_a_drift_of_the_gain_is_told_by_size():
         # a zero, a stage at rest and the first second tell nothing of it
         assert not seen.drift[:900].any()
     assert seen.drift_std[-1] < 2e-4
+
+
+def walk(size, share, rng, begin=None):
+    """Return a first-order random walk of this size, `share` of it left from sample to sample."""
+    steps = size * np.sqrt(1.0 - share**2) * rng.standard_normal(share.size)
+    steps[0] = size * rng.standard_normal() if begin is None else begin
+    x = np.zeros(share.size)
+    for k in range(share.size):
+        x[k] = share[k] * x[k - 1] + steps[k]
+    return x
+
+
+def test_a_ramp_of_the_gain_is_followed_within_what_is_claimed():
+    rate, n, error = 10_000, 50_000, 3e-4
+    model, v = creeping(float(rate)), scanned(n, rate)
+    free, late = model.simulate(v), slice(2 * rate, None)
+    left = np.exp(-np.abs(np.diff(model.scaling.u(v), prepend=0.0)) / PATH)
+    stays = np.full(n, np.exp(-1.0 / (rate * DRIFT_TIME)))
+    shares = []
+    for seed in range(4):
+        # an error of the model and a drift as the observer assumes them
+        rng = np.random.default_rng(seed)
+        drift = walk(DRIFT_SIZE, stays, rng, begin=DRIFT_SIZE)
+        gain = np.cumsum(drift) / rate
+        truth = (1.0 + gain) * free + SPAN * walk(error, left, rng)
+        piece = Piece(v, with_noise(truth, 1.5e-9, seed), float(rate))
+        options = {'error': error * SPAN, 'noise': 1.5e-9}
+        plain = observe(model, piece, gain=True, **options)
+        seen = observe(model, piece, drift=True, **options)
+        off = (seen.estimate - truth)[late]
+        assert rms(off) < 1.2 * error * SPAN < 0.5 * rms((plain.estimate - truth)[late])
+        assert rms((seen.gain - gain)[late]) < 0.3 * rms((plain.gain - gain)[late])
+        shares.append(
+            [
+                np.mean(np.abs(off) < 1.645 * seen.std[late]),
+                np.mean(np.abs(seen.drift - drift)[late] < 1.645 * seen.drift_std[late]),
+            ]
+        )
+    assert np.all(np.abs(np.mean(shares, axis=0) - 0.9) < 0.05), shares
 
 
 def test_a_stage_whose_law_is_another_is_served_no_worse_with_the_gain_observed():
