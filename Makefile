@@ -94,10 +94,11 @@ coverage: .venv/.demo
 	    --diagnosed 1 --draws 10 --picture build/images/coverage.png,docs/coverage.md)
 
 # how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
-# cores; goes on where it was stopped
+# cores; goes on where it was stopped; SAMPLE=60 for so many cases of each, drawn at random
+STUDY = .venv/bin/python benchmarks/study_diagnosis.py $(if $(SAMPLE),--sample $(SAMPLE))
 study: .venv/.demo
-	.venv/bin/python benchmarks/study_diagnosis.py docs/diagnosis_study.md
-	.venv/bin/python benchmarks/study_diagnosis.py --set next docs/diagnosis_study_foreign.md
+	$(STUDY) docs/diagnosis_study.md
+	$(STUDY) --set next docs/diagnosis_study_foreign.md
 
 # what docs/reliability.md says, run again; then the page is made of what came out
 RUN_STUDY = .venv/bin/python benchmarks/reliability

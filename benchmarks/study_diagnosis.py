@@ -384,7 +384,9 @@ def case_line(r: Row) -> list[object]:
     ]
 
 
-def write(rows: dict[str, Row], todo: Sequence[Case | SumCase], group: str, page: Path) -> None:
+def write(
+    rows: dict[str, Row], todo: Sequence[Case | SumCase], group: str, page: Path, drawn: str
+) -> None:
     """Write the page of the study, and the file of its cases."""
     of_sums = group in SUM_SEEDS
     done = [rows[case.key] for case in todo if case.key in rows]
@@ -396,7 +398,7 @@ def write(rows: dict[str, Row], todo: Sequence[Case | SumCase], group: str, page
         note = SUMS.format(laws=laws.name)
     sections = [
         *PURPOSES[of_sums],
-        f'Made by `make study`, set `{group}`; {len(done)} of {len(todo)} cases done.\n'
+        f'Made by `make study`, set `{group}`; {len(done)} of {len(todo)} cases{drawn} done.\n'
         f'Machine: {machine()}.',
         note,
         write_cases(page, CASE_HEADS, map(case_line, done)),
@@ -421,16 +423,17 @@ def main() -> None:
     arguments = parser.parse_args()
     group, of_sums = arguments.group, arguments.group in SUM_SEEDS
     every = sum_cases(group) if of_sums else (draw(group, k) for k in range(CASES[group]))
-    todo = list(every)[: arguments.first]
+    todo, drawn = list(every)[: arguments.first], ''
     if arguments.sample:
         # the same ones every time, so that two versions of the package can be compared
-        drawn = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
-        todo = [todo[i] for i in drawn]
+        chosen = np.random.default_rng(14).choice(len(todo), arguments.sample, replace=False)
+        drawn = f', drawn at random from {len(todo)},'
+        todo = [todo[i] for i in chosen]
     todo = [case for case in todo if re.search(arguments.only, case.key)]
     name = 'study_diagnosis' if of_sums else f'study_foreign_{group}'
     path = arguments.kept or Path(f'build/{name}.jsonl')
     rows = all_rows(path, Row, todo, judged, arguments.processes)
-    write(rows, todo, group, arguments.out)
+    write(rows, todo, group, arguments.out, drawn)
     sys.stdout.write(f'{arguments.out}\n')
 
 
