@@ -80,8 +80,8 @@ before:
 - **with its gain**: `estimate` with `observe_gain`;
 - **adaptation**: `estimate` with `adapt` = `hysteresis`.
 
-The error is the rms of what they say less the displacement without noise, in % of the span of the
-stage, its mean included. *After the change* is from {judged:g} to {rest:g} s behind it. The last
+The error is the rms difference to the displacement without noise, in % of the span of the stage.
+The mean is included. *After the change* is from {judged:g} to {rest:g} s behind it. The last
 two columns of the first table are ratios to the best of observer, gain and adaptation.
 
 {after}

@@ -6,7 +6,7 @@ How well simulated stages are identified: seeds, noise levels, thresholds off th
 
     .venv/bin/python benchmarks/study_identification.py docs/identification_study.md
 
-Errors are free-run errors against the noise-free stage, 100 rms(y - y_hat) / (max y - min y), on
+The error of a free run against the stage without noise is 100 rms(y - y_hat) / (max y - min y), on
 motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and minor loops.
 """
 
@@ -97,8 +97,8 @@ TEXT = """\
 # How well simulated stages are identified
 
 This page shows how near the three steps come to known stages. It was made by
-`make study-identification`. Errors are free-run errors against the noise-free stage,
-100 rms(y - y_hat) / (max y - min y), on motions that were not fitted: the sines
+`make study-identification`. The error is 100 rms(y - y_hat) / (max y - min y) of a free
+run against the stage without noise. The motions were not fitted: sines
 v = 5 + 5 sin(2 pi f t) in steady state, and minor loops at three biases with a decaying
 triangle.
 
@@ -106,8 +106,8 @@ Python {python}, {versions}
 
 ## Twenty seeds and three noise levels, the paper's stage
 
-The flattering case: the truth lies on the model's own thresholds. 16-bit converters.
-"Worst error" is the largest over the six sines and all seeds. "Swarm" counts the seeds
+The truth lies on the thresholds of the model, which flatters the result. The converters have
+16 bits. The worst error is the largest over the six sines and all seeds. "Swarm" counts the seeds
 whose loss was within 1 % of bounded least squares. The swarm made the models.
 
 {seeds}
