@@ -85,8 +85,8 @@ TEXT = """\
 `make study-xy` made this page. The model does not have the laws of this simulated scanner.
 The first axis is a Preisach operator with an uneven density and a mode at 190 Hz. The second axis
 obeys the law of Bouc and Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either
-axis moves the other by {cross:g} %, through its own mode and one of the guide at 310 Hz. The axes are
-sampled at {rate:g} kHz; the sensors have {noise:g} % of noise.
+axis moves the other by {cross:g} %, through its own mode and one of the guide at 310 Hz. The axes
+are sampled at {rate:g} kHz; the sensors have {noise:g} % of noise.
 
 One record of {seconds:.0f} s taught the model. Each axis played its three steps while the other
 one rested ({learn:.0f} s, `pi.identify`); then both moved ({move:.0f} s, `pi.diagnose`). The

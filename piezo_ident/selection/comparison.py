@@ -23,8 +23,8 @@ from piezo_ident.fitting.free_run import Fit
 ALIKE = 1.1
 #: an effect must lower the mean square to at most this share of its value without the effect
 EFFECT = 0.4
-#: least mean square that is told from zero: the square of 1e-10 of the stroke, which is below a
-#: hundredth of a step of a 24-bit converter; rounding decides between smaller ones
+#: smallest mean square that differs from zero: the square of 1e-10 of the stroke.  A step of a
+#: 24-bit converter is hundreds of times larger.  Rounding decides between smaller errors
 RESOLVED = 1e-20
 
 
@@ -78,8 +78,8 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     """
     Choose the candidate with the lowest price; of alike prices, the fewest parameters.
 
-    The lower price decides between equal numbers of parameters.  Of candidates without a resolved
-    error the first is chosen: which weights of theirs are zero is a matter of rounding.
+    The lower price decides between equal numbers of parameters.  The first candidate
+    wins if no error is resolved, because rounding decides which of the weights are zero.
     """
     least = min(c.price for c in candidates)
     alike = [c for c in candidates if c.price <= ALIKE * least]

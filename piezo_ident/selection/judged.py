@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a model sample by sample, and what they promise for other records."""
+"""Errors of a model sample by sample, and the promise for other records."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class JudgedRun:
 @dataclass(frozen=True, eq=False)
 class Judged:
     """
-    What promise, band and deviations of an identification follow from.
+    Base of the promise, the band and the deviations of an identification.
 
     `fit` is the fit of all parameters together; None if the model was identified in steps.
     """
@@ -64,8 +64,8 @@ class Promise:
     Expected free-run errors on another record of the same stage, % of stroke.
 
     `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
-    within the swings and speeds of these records.  What follows time, such as hum or a drift, is
-    in the other record, too, and in no model.
+    within the swings and speeds of these records.  Hum, drift and other
+    effects of time count in full: the other record has them, and the model does not.
     """
 
     same: float

@@ -5,8 +5,8 @@
 Find kinds of motion in a record without labels, from the voltage in each block.
 
 A block is described by the mean, the size and the speed of its voltage.  Similar blocks form a
-kind.  A kind with the smallest or largest mean, size or speed is never held out: a model that was
-fitted without it would have to extrapolate.
+kind.  A kind with the smallest or largest mean, size or speed is always fitted, because a model
+that was fitted to the others would extrapolate.
 """
 
 from __future__ import annotations
