@@ -8,22 +8,22 @@ The scale of the error is
 
     q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2,
 
-in spans, with swing S and speed D of `piezo_ident.uncertainty.motion`.  r_k^2 is the mean
-square of error over q of kind k of K, with the coefficients that the other kinds give.  Errors
-within a kind are alike, so a kind counts as one observation with the mean zero.  The half width
-at level p holds one more observation:
+in spans, with swing S and speed D of `piezo_ident.uncertainty.motion`.  The other kinds give the q
+of a kind k of K, and r_k^2 is its mean square of error over q.  Errors within a kind are alike, so
+a kind counts as one observation with the mean zero.  The half width at level p holds one more
+observation:
 
     q lambda,        lambda = t_K((1 + p) / 2) sqrt(1 + 1/K) sqrt(mean r_k^2),
 
 with the quantile t_K of Student's distribution with K degrees of freedom (W. Q. Meeker, G. J. Hahn
 and L. A. Escobar, Statistical Intervals, 2nd ed., 2017, section 4.7,
-doi:10.1002/9781118594841).  So p is a share of the samples over kinds of motion, not of the
-samples of one record: a whole record may leave its band.
+doi:10.1002/9781118594841).  The share p counts samples over kinds of motion: a whole record may
+leave its band.
 
 Limits: the band holds for the stage as it was when the record was made, with the zero of its
 sensor.  Outside the excited range of the voltage it widens by the distance, as the slope of H is
-unknown there.  It is infinite, which means not known, `FAR` outside the range or at `FAST` times
-the highest speed of the records.
+unknown there.  The band is infinite, which means not known, `FAR` outside the range or at `FAST`
+times the highest speed of the records.
 """
 
 from __future__ import annotations
@@ -123,9 +123,9 @@ class BandStream:
     Half width of a stream of predictions, block by block.
 
     `plays` and `creep` tell whether the memory of the plays, and the creep from before, are known
-    at the start.  Otherwise the band contains what the plays may remember, until the voltage has
-    swept them, and the creep that may go on.  Raises ModelError if the model carries no band, and
-    ConfigError if the level does not lie between 0 and 1.
+    at the start.  Otherwise the band contains all possible memory of the plays, until the voltage
+    has swept them, and the creep that may go on.  Raises ModelError if the model carries no band,
+    and ConfigError if the level does not lie between 0 and 1.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class BandStream:
         return np.asarray(half * abs(model.scaling.Y))
 
     def _of_start(self, u: Array) -> Array:
-        """Compute what the unknown start may still change, normalised, shape (n,)."""
+        """Compute the largest effect of the unknown start, normalised, shape (n,)."""
         gain, left = self._model.dynamics.gain, np.zeros(u.size)
         if not self._plays:
             if self._bounds is None:

@@ -32,8 +32,8 @@ def linearised(result: Identification) -> Linearised | None:
     """
     Linearise the free run of an identified model at its parameters.
 
-    None for a model that no such fit describes: weights of the swarm, fitted starts of labelled
-    records, records that would take too long.
+    Returns None for weights of the swarm, for fitted starts of labelled records, and for records
+    that would take too long.
     """
     if result.judged is None or result.hysteresis.solver == 'swarm':
         return None
@@ -44,7 +44,7 @@ def linearised(result: Identification) -> Linearised | None:
         stage = stage_of(model, result.hysteresis.law, len(runs))
     except ModelError:
         return None
-    # a fitted start is no parameter of these equations
+    # these equations hold the start constant
     if result.memories or stage.values.size * sum(r.use.size for r in runs) > MOST_WORK:
         return None
     return Linearised.of(fit(stage, _stretches(model, runs), iterations=0))

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Describe motion sample by sample by what makes a free run err: its swing and its speed.
+Describe motion sample by sample by its swing and its speed, with which free runs err more.
 
 - Swing: the distance between the last two turning points of the voltage, or from the last of them
   to the voltage, whichever is larger.  The misfit of H grows with the loop that is travelled.
 - Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
   of G.  The misfit of G and of the delay grows with it.
 
-Both follow from the past alone, so a stream gives the same values as a whole record.
+Swing and speed follow from the past alone, so a stream gives the same values as a whole record.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from piezo_ident.common.kernel import alive, ordered_kernel
 from piezo_ident.model.stage_model import StageModel
 
 #: way back after which an extreme of the voltage counts as a turning point, as a share of the
-#: range: above the noise of a measured voltage, below a loop whose error matters (taste)
+#: range (taste).  Noise of a measured voltage is smaller, and loops whose error matters are larger
 TURN = 2e-3
 #: shortest and longest time in which the speed of the past fades [samples, s]; taste
 FEWEST, LONGEST = 10.0, 0.1

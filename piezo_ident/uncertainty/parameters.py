@@ -4,13 +4,13 @@
 """
 State the quantities that a user reads from a model, with their standard deviations.
 
-Each deviation is that of another record of the same motion and noise, from the replicates of
-`piezo_ident.fitting.jackknife`.  A 95 % interval is the value with Student's quantile for one
-degree of freedom fewer than blocks, about twice the deviation, to either side.
+A deviation tells how far another record of the same motion and noise would move a quantity.  The
+replicates of `piezo_ident.fitting.jackknife` give it.  A 95 % interval is the value with Student's
+quantile for one degree of freedom fewer than blocks, about twice the deviation, to either side.
 
 Limits: the delay is a whole number of samples and does not vary in these equations.  The error of
-the law of H is in the deviations as far as it differs from block to block; a part that all blocks
-share is a bias, and no record of the same motion shows it.
+the law of H is in the deviations as far as it differs from block to block.  An error that all
+blocks share is a bias, which appears on other motion only.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def with_deviations(result: Identification) -> Identification:
     try:
         fitted = linearised(result)
     except IdentificationError:
-        # equations without a solution tell nothing
+        # the deviations of the steps stay
         fitted = None
     if fitted is None:
         return result
@@ -62,7 +62,7 @@ def with_deviations(result: Identification) -> Identification:
         found.append(np.concatenate([moved, _coefficients(stage)]))
     whole = np.concatenate([at, _coefficients(fitted.stage)])
     std = deviations(np.array(found).reshape(-1, whole.size), whole)
-    # what a replicate lacks, such as a mode, is not known
+    # a mode that replicates lack is not known
     told = np.where(np.isfinite(std), std, np.inf)
     quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=False)]
     known = {**model.identification, QUANTITIES: quantities}
@@ -71,7 +71,7 @@ def with_deviations(result: Identification) -> Identification:
 
 
 def quantities_of(model: StageModel, result: Identification) -> list[ModelParameter]:
-    """List the quantities of a sum of plays, such as a simulated stage, as those of a result."""
+    """List the quantities of a sum of plays, such as a simulated stage, as for a result."""
     near = result.model.dynamics
     return list(_quantities(stage_of(model, 'plays'), model, _frequencies(result), near))
 
@@ -90,7 +90,7 @@ def _coefficients(stage: Stage) -> Array:
 def _of_coefficients(
     stage: Stage, model: StageModel, std: Array, known: dict[str, Any]
 ) -> dict[str, Any]:
-    """Replace the deviations of single steps by those of all parameters together."""
+    """Replace the deviations of single steps by deviations of all parameters together."""
     m, na = stage.law.thresholds.size, stage.dynamics.a.size
     own = np.isin(stage.law.thresholds, model.hysteresis.thresholds)
     weights, powers, a, b = np.split(std, [m, m + 3, m + 3 + na])
@@ -102,7 +102,7 @@ def _of_coefficients(
 def _quantities(
     stage: Stage, model: StageModel, frequencies: Array, near: Dynamics
 ) -> Iterator[ModelParameter]:
-    """Yield the quantities of a stage; modes are the nearest to those of `near`."""
+    """Yield the quantities of a stage; its modes are the nearest to the modes of `near`."""
     s, rate, h, G = model.scaling, model.sample_rate, stage.hysteresis, stage.dynamics
     low, high = s.u(np.array(s.range)).tolist()
     line = float(np.diff(h(np.array([low, high])))[0] / (high - low))

@@ -29,8 +29,8 @@ def half_widths(
     Compute the half width of the band of each piece of a record [m].
 
     `estimated` tells for each piece whether its displacement gave the start.  Then the plays may
-    err until they are forgotten.  Without `estimated` the voltage alone is known: the plays are
-    known from a start at rest, and the creep from before is not.
+    err until they are forgotten.  Without `estimated` the voltage alone is known.  A start at rest
+    then gives the plays, and the creep from before is in the band.
     """
     found = list[Array]()
     for pieces in connected_pieces(record):
@@ -57,7 +57,6 @@ def unknown_parts(half: Sequence[Array]) -> list[str]:
     if not lost:
         return []
     return [
-        f'the error is not known for {100.0 * lost / n:.2g} % of the samples: their voltage lies '
-        f'more than {FAR:.0%} outside the range of the model, or they move more than {FAST:g} '
-        'times as fast as the records that the band comes from'
+        f'the error is not known for {100.0 * lost / n:.2g} % of the samples: they lie more than '
+        f'{FAR:.0%} outside the range of the model, or are over {FAST:g} times as fast as its data'
     ]

@@ -4,12 +4,12 @@
 """
 Promise the error of another record, and give the model its prediction band.
 
-The promise for the same kinds of motion is the rms error of the model on its records, with what
-samples held out err more than samples fitted.  The promise for motion of another kind is the rms
-of the scale of the band over all pairs of a swing of one kind and a speed of another, times the
-ratio by which kinds that were left out exceed this scale (`piezo_ident.uncertainty.band`).
+The promise for the same kinds of motion is the rms error of the model on its records, raised to
+the error of held-out samples.  The promise for motion of another kind is the rms of the scale of
+the band, times its ratio (`piezo_ident.uncertainty.band`).  The rms is over all pairs of a swing
+of one kind and a speed of another.
 
-After a diagnosis the errors are those of the refined model in free run.  This model carries
+After a diagnosis the errors are free-run errors of the refined model.  This model carries
 nothing that follows time alone, such as hum, drift and a wandering gain, so the records count them
 in full.
 
@@ -70,7 +70,7 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     band = calibrated(other)
     promise = _promise(same, other, band, abs(model.scaling.Y), stroke)
     if result.changes:
-        # the deviations are those of the model as given
+        # the deviations belong to the given model
         known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
         model = replace(model, identification=known)
     result = replace(result, model=with_band(model, band), promise=promise)
@@ -102,7 +102,7 @@ def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
 
 
 def _excess(result: Diagnosis, errors: Errors | None, stroke: float) -> dict[str, float]:
-    """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
+    """Compute by how much held-out errors exceed errors of the fit, by segment, squares [m^2]."""
     held, fitted = {} if errors is None else errors.by_segment, dict[str, list[Array]]()
     for r in result.residuals:
         for label, start, stop in stretches(r.record, r.piece):

@@ -4,8 +4,8 @@
 """
 Weigh the candidates of a diagnosis by their errors on kinds of motion that were held out.
 
-A set s of effects that leaves the mean square E_s predicts the held-out data of N kinds of motion,
-each of which counts as one observation of unknown size.  Its weight is
+A set s of effects leaves the mean square E_s on N kinds of motion that were held out.  A kind
+counts as one observation of unknown size.  The weight of the set is
 
     w_s = p_s E_s^(-N/2) / sum of all,
 
@@ -13,12 +13,12 @@ pseudo Bayesian model averaging: Y. Yao, A. Vehtari, D. Simpson and A. Gelman, "
 average Bayesian predictive distributions", Bayesian Analysis 13(3), 2018, doi:10.1214/17-BA1091.
 
 ``none of these`` stands for a stage that lacks nothing, and for a cause outside of the catalogue.
-Its E is the error without an effect times `TAKES`: a set that removes less than a cause must
-remove is less likely than none.  The prior of none is `NONE`.  A further effect is `FURTHER` times
-as likely as the first one, and sets of one size are equally likely.
+Its E is the mean square without an effect times `TAKES`, the least share that a cause takes.  The
+prior of none is `NONE`.  A further effect is `FURTHER` times as likely as the first one, and sets
+of one size are equally likely.
 
-Limits: E_s is known to the number of kinds alone, and the sets compared are those that the search
-fitted.  The weights of effects that tests of their own have shown, such as hum, are not in them.
+Limits: the number of kinds bounds how well E_s is known, and only sets that the search fitted are
+compared.  Effects with tests of their own, such as hum, have no weight.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from piezo_ident.diagnosis.criteria import TAKES
 
 #: name of the last weight
 NOTHING = 'none of these'
-#: prior of none, and ratio of the priors of sets with one effect more (taste: nothing known)
+#: prior of none, and ratio of the priors of sets with one effect more (taste)
 NONE, FURTHER = 0.5, 0.25
 #: number of parts that stand for kinds of motion where the record has none
 PARTS = 5
