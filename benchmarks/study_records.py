@@ -49,8 +49,17 @@ segments:
   - {{signal: settle, bias: {middle}, amplitude: {settle}, cycles: 16, frequency: 20}}
   - {{signal: noise, bias: {middle}, amplitude: {noise}, cutoff: {cutoff}, duration: {duration}}}
   - {{signal: triangle, slope: {slope}}}
-  - {{signal: idle, duration: 0.3}}
 """
+#: behind it, of `program_identification_loops.yaml`
+LOOPS = """
+  - {{signal: decaying_triangle, name: loops, bias: {middle}, amplitude: {large}, cycles: 5,
+      slope: {slew}}}
+  - {{signal: multisine, name: slow, bias: {middle}, amplitude: {large}, lowest: 0.5, highest: 10,
+      period: 2, periods: 1}}
+  - {{signal: multisine, name: fast, bias: {middle}, amplitude: {large}, lowest: 1, highest: 100,
+      period: 1, periods: 1}}
+"""
+IDLE = '  - {{signal: idle, duration: 0.3}}\n'
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +124,15 @@ def measured(
     return model, records[0], records[1]
 
 
-def motions(case: Case, stage: FamilyStage) -> dict[str, Motion]:
-    """Return what each record of a case is driven with, in parts of the range."""
+def motions(case: Case, stage: FamilyStage, loops: bool = False) -> dict[str, Motion]:
+    """Return the motion of each record of a case in parts of the range; see `case_records`."""
     (low, high), rng = stage.limits, np.random.default_rng([606, case.seed])
     # a bipolar amplifier often rests at 0 V, which is not its lowest voltage
     rest = -low / (high - low) if low < 0 and rng.random() < 0.5 else 0.0
     found = {}
     for name in ('identification', 'diagnosis', 'unseen'):
         if name == 'identification' and case.labelled:
-            found[name] = programmed(stage, rest)
+            found[name] = programmed(stage, rest, loops)
         else:
             found[name] = record_motion(
                 name,
@@ -137,11 +146,11 @@ def motions(case: Case, stage: FamilyStage) -> dict[str, Motion]:
     return found
 
 
-def programmed(stage: FamilyStage, rest: float) -> Motion:
+def programmed(stage: FamilyStage, rest: float, loops: bool = False) -> Motion:
     """Return the program of the identification in the stage's range."""
     low, high = stage.limits
     span, fast = high - low, stage.rate > 30_000
-    text = PROGRAM.format(
+    text = (PROGRAM.rstrip() + (LOOPS if loops else '\n') + IDLE).format(
         low=low,
         high=high,
         rest=low + rest * span,
@@ -153,22 +162,23 @@ def programmed(stage: FamilyStage, rest: float) -> Motion:
         cutoff=min(3000.0, 0.3 * stage.rate),
         duration=2.0 if fast else 3.0,
         slope=(1.6 if fast else 1.1) * span,
+        large=0.45 * span,
     )
     sequence = parse_program(text).build(sample_rate=stage.rate)
     labels = tuple((s.label, s.start, s.stop) for s in sequence.segments)
     return Motion((sequence.v - low) / span, labels)
 
 
-def case_records(case: Case, forms: bool = True) -> Records:
+def case_records(case: Case, forms: bool = True, loops: bool = False) -> Records:
     """
     Return the records of a case, and the truth.
 
     `case`: of `truths.draw`; `forms`: also compare forms of the hysteresis, which takes some
-    seconds.
+    seconds; `loops`: a labelled identification follows the program with loops of all sizes.
     """
     stage = make_family_stage(case.core, case.seed, case.effects, further=case.group != 'tuning')
     low, high = stage.limits
-    moved = motions(case, stage)
+    moved = motions(case, stage, loops)
     volts = {name: low + (high - low) * m.u for name, m in moved.items()}
     plain = {
         name: (v, stage.read(stage.respond(v, name, {}, clean=True), name))

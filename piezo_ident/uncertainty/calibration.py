@@ -6,15 +6,18 @@ Calibrate a prediction band on the errors of whole kinds of motion, each of them
 
 The coefficients of the scale q are fitted to the rms errors of blocks, with equal weight for every
 kind.  Then each kind is predicted by the coefficients that the other kinds give.  Leaving out
-single samples would test nothing, because errors of neighbouring samples are alike: D. R. Roberts
+single samples would test nothing, because errors of neighbours are alike: D. R. Roberts
 et al., "Cross-validation strategies for data with temporal, spatial, hierarchical, or phylogenetic
 structure", Ecography 40(8), 2017, doi:10.1111/ecog.02881.
+
+H errs more on loops between the loops that it was fitted to.  A kind with fitted samples therefore
+counts with its error, or with the error that kinds without fits give for its motion if larger.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -30,8 +33,8 @@ from scipy.optimize import least_squares
 BLOCKS, SHORTEST = 80, 20
 #: smallest scale of the error in spans: a tenth of a bit of a 16 bit converter
 LEAST = 1.5e-6
-#: weight of the prior that a coefficient is the error of all blocks over the largest value of its
-#: motion, against one block (taste: it decides only what the blocks leave open)
+#: weight of the prior against one block (taste: it decides only coefficients that the blocks leave
+#: open).  Its coefficients are the error of all blocks over the largest value of the motion
 PRIOR = 1e-3
 
 
@@ -47,6 +50,8 @@ class Blocks:
     motion : ndarray, shape (blocks, 3)
         Mean squares of 1, swing and speed.
     kind : ndarray of int, shape (blocks,)
+    fitted : ndarray of bool, shape (blocks,)
+        Whether a fit used samples of the kind.
     weight : ndarray, shape (blocks,)
         Number of samples.
     speed : float
@@ -56,6 +61,7 @@ class Blocks:
     square: Array
     motion: Array
     kind: Integers
+    fitted: Mask
     weight: Integers
     speed: float
 
@@ -81,7 +87,7 @@ def blocks_of(
     size = max(SHORTEST, sum(int(run.use.sum()) for run in runs) // BLOCKS)
     Y, highest = abs(model.scaling.Y), 0.0
     labels, commands, squares, motions = list[str](), list[Array](), list[float](), list[Array]()
-    weights = list[int]()
+    weights, fitted = list[int](), list[bool]()
     for run in runs:
         u, x = model.scaling.u(run.piece.v), model.scaling.x(run.predicted)
         stream, e = Motion(model), run.error
@@ -99,16 +105,18 @@ def blocks_of(
                 squares.append((square + (excess or {}).get(label, 0.0)) / Y**2)
                 motions.append(np.append(1.0, np.mean(motion[:, own] ** 2, axis=1)))
                 weights.append(own.size)
+                fitted.append(not run.held[start + own].all())
     if len(labels) < 2 or not np.isfinite(squares).all():
         # a model that diverges has no band
         return None
     kind = np.unique(held_out_kinds(labels, commands)[0], return_inverse=True)[1]
     square = np.maximum(np.array(squares), LEAST**2)
-    return Blocks(square, np.array(motions), kind, np.array(weights), highest)
+    used = np.bincount(kind, fitted)[kind] > 0
+    return Blocks(square, np.array(motions), kind, used, np.array(weights), highest)
 
 
 def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
-    """Compute the mean squared error of samples held out over that of all samples."""
+    """Compute the ratio of mean squared errors: samples held out to all samples."""
     own = use & held
     if min(own.sum(), (use & ~held).sum()) < SHORTEST or not e2[use].any():
         return 1.0
@@ -117,14 +125,26 @@ def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
 
 def calibrated(blocks: Blocks) -> PredictionBand:
     """Fit a band to blocks, and predict each kind from the others."""
-    whole = _coefficients(blocks, np.ones(blocks.kind.size, dtype=bool))
+    every = np.ones(blocks.kind.size, dtype=bool)
+    whole = _coefficients(_raised(blocks, every), every)
     ratios = []
     for k in range(blocks.kinds):
         own = blocks.kind == k
-        c = whole if own.all() else _coefficients(blocks, ~own)
-        ratio = blocks.square[own] / _square(c, blocks.motion[own])
+        rest = every if own.all() else ~own
+        raised = _raised(blocks, rest)
+        c = _coefficients(raised, rest)
+        ratio = raised.square[own] / _square(c, blocks.motion[own])
         ratios.append(float(np.average(ratio, weights=blocks.weight[own])))
     return PredictionBand(whole, blocks.kinds, math.sqrt(np.mean(ratios)), blocks.speed)
+
+
+def _raised(blocks: Blocks, chosen: Mask) -> Blocks:
+    """Raise errors of fitted kinds to the errors that the chosen kinds without fits expect."""
+    if not np.any(unfitted := chosen & ~blocks.fitted):
+        return blocks
+    expected = _square(_coefficients(blocks, unfitted), blocks.motion)
+    larger = np.maximum(blocks.square, np.where(blocks.fitted, expected, 0.0))
+    return replace(blocks, square=larger)
 
 
 def _square(c: Array, motion: Array) -> Array:

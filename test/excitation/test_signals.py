@@ -21,7 +21,15 @@ import pytest
 import yaml
 
 FS = 20_000.0
-CONFIG = ('identification', 'validation', 'minor_loops', 'survey', 'diagnosis', 'holds')
+CONFIG = (
+    'identification',
+    'identification_loops',
+    'validation',
+    'minor_loops',
+    'survey',
+    'diagnosis',
+    'holds',
+)
 
 
 def program(*segments: dict, **head) -> Program:
@@ -274,9 +282,8 @@ def test_programs_that_come_along(name):
         segment.start for segment in s.segments
     ]
     # any rate will do
-    assert Program.load(name).build(5000 if name != 'identification' else 10_000).duration == (
-        pytest.approx(s.duration, rel=1e-2)
-    )
+    rate = 10_000 if name.startswith('identification') else 5000
+    assert Program.load(name).build(rate).duration == pytest.approx(s.duration, rel=1e-2)
 
 
 def test_identification_program_has_what_the_three_steps_need():
@@ -288,6 +295,16 @@ def test_identification_program_has_what_the_three_steps_need():
     assert np.count_nonzero(np.diff(part['step'])) >= 10
     assert np.ptp(part['settle']) > np.ptp(part['noise'])
     assert (part['triangle'].min(), part['triangle'].max()) == (0.0, 10.0)
+
+
+def test_the_program_with_loops_is_identification_with_motion_of_all_sizes_behind_it():
+    plain, loops = (Program.load(f'identification{x}') for x in ('', '_loops'))
+    assert loops.entries[: len(plain.entries) - 1] == plain.entries[:-1]
+    s = loops.build()
+    part = {x.label: s.v[x.start : x.stop] for x in s.segments}
+    for label in ('triangle:loops', 'multisine:slow', 'multisine:fast'):
+        assert np.ptp(part[label]) > 7.0
+    assert s.duration < 23
 
 
 def test_validation_program_is_the_papers_six_sines():

@@ -77,6 +77,20 @@ def test_calibration_finds_what_the_error_follows(place):
     assert band.ratio == pytest.approx(1.0, rel=0.5)
 
 
+def test_kinds_without_fits_raise_the_error_of_fitted_kinds_and_not_the_other_way():
+    run = judged(lambda motion: 1e-3 * motion[0], ('triangle', 'noise', 'sine:slow', 'sine:fast'))
+    third = run.piece.find('sine')[0].start
+    size = np.where(np.arange(run.use.size) < third, 1.0, 10.0)
+    worse = replace(run, predicted=run.piece.y - size * run.error)
+    outside = np.arange(run.use.size) >= third
+    swing = [
+        calibrated(blocks_of(PAPER, [replace(worse, held=held)])).scale(np.array([[1.0], [0.0]]))
+        for held in (outside, np.zeros_like(outside), ~outside)
+    ]
+    assert swing[0] == pytest.approx(1e-2, rel=0.15)
+    assert swing[1] < 0.8 * swing[0] and swing[2] < 0.8 * swing[0]
+
+
 def test_samples_held_out_count_more_than_samples_fitted():
     run = judged(lambda motion: np.full(motion.shape[1], 1e-3))
     held = np.arange(run.use.size) % 2 == 1
