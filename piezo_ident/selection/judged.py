@@ -57,6 +57,15 @@ class Judged:
     runs: tuple[JudgedRun, ...]
     fit: Fit | None = None
 
+    @property
+    def tests_other_motion(self) -> bool:
+        """Whether a segment of motion was in no fit; a fit of all parameters holds out parts."""
+        return self.fit is not None or any(
+            s.kind not in ('idle', 'ramp') and run.held[s.start : s.stop].all()
+            for run in self.runs
+            for s in run.piece.segments
+        )
+
 
 @dataclass(frozen=True)
 class Promise:
@@ -64,14 +73,20 @@ class Promise:
     Expected free-run errors on another record of the same stage, % of stroke.
 
     `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
-    within the swings and speeds of these records.  Hum, drift and other
+    within the swings and speeds of these records.  `other` is None, which means not known, if each
+    segment of motion was in a fit.  Hum, drift and other
     effects of time count in full: the other record has them, and the model does not.
     """
 
     same: float
-    other: float
+    other: float | None
 
     @property
     def told(self) -> str:
         """The promise in words."""
+        if self.other is None:
+            return (
+                f'{self.same:.3g} % of stroke on such motion; the error on another kind of motion '
+                'is not known, as every segment was fitted: play `identification_loops`'
+            )
         return f'{self.same:.3g} % of stroke, {self.other:.3g} % on another kind of motion'

@@ -125,15 +125,13 @@ def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
 
 def calibrated(blocks: Blocks) -> PredictionBand:
     """Fit a band to blocks, and predict each kind from the others."""
-    every = np.ones(blocks.kind.size, dtype=bool)
+    every, ratios = np.ones(blocks.kind.size, dtype=bool), list[float]()
     whole = _coefficients(_raised(blocks, every), every)
-    ratios = []
     for k in range(blocks.kinds):
         own = blocks.kind == k
         rest = every if own.all() else ~own
         raised = _raised(blocks, rest)
-        c = _coefficients(raised, rest)
-        ratio = raised.square[own] / _square(c, blocks.motion[own])
+        ratio = raised.square[own] / _square(_coefficients(raised, rest), blocks.motion[own])
         ratios.append(float(np.average(ratio, weights=blocks.weight[own])))
     return PredictionBand(whole, blocks.kinds, math.sqrt(np.mean(ratios)), blocks.speed)
 

@@ -48,10 +48,12 @@ def promised_identification(result: Identification) -> Identification:
     """Add promise and band to an identification."""
     judged, model = result.judged, result.model
     blocks = None if judged is None else blocks_of(model, judged.runs)
-    if blocks is None:
+    if blocks is None or judged is None:
         return result
     band = calibrated(blocks)
     promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
+    if not judged.tests_other_motion:
+        promise = replace(promise, other=None)
     return replace(result, model=with_band(model, band), promise=promise)
 
 

@@ -3,6 +3,7 @@
 
 """Promises: what another record of the same motion, and of other motion, will show."""
 
+from dataclasses import replace
 import functools
 
 import numpy as np
@@ -10,7 +11,8 @@ from paper_stage import FS, PAPER
 from piezo_ident import report
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.identification.results import Settings
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Piece, Record, Segment
+from piezo_ident.selection.judged import Judged, JudgedRun, Promise
 from piezo_ident.uncertainty.band import KEY
 from piezo_ident.verbs.learn import diagnose, identify
 import pytest
@@ -80,3 +82,18 @@ def test_an_identification_promises_what_the_next_record_shows():
     assert 0.7 < other / result.promise.same < 1.3
     assert result.promise.told in ' '.join(report.identification_text(result).split())
     assert report.to_json(result)['promise']['other_motion'] == result.promise.other
+
+
+def test_where_every_motion_was_fitted_the_error_of_other_motion_is_not_known():
+    v = motion()[:1000]
+    segments = (Segment('ramp', 0, 100), Segment('triangle', 100, 500), Segment('sine', 500, 1000))
+    piece = Piece(v, 1e-6 * v, FS, segments=segments)
+    outside = np.arange(v.size) >= 500
+    run = JudgedRun('record', piece, piece.y, np.ones(v.size, dtype=bool), outside)
+    assert Judged((run,)).tests_other_motion
+    fitted = replace(run, held=np.arange(v.size) < 100)
+    assert not Judged((fitted,)).tests_other_motion
+    assert (
+        'not known' in Promise(0.1, None).told
+        and 'identification_loops' in Promise(0.1, None).told
+    )
