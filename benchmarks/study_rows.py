@@ -102,8 +102,9 @@ def dots_and_ranges(
     """
     fig = style.figure(0.8 + (0.2 + 0.08 * len(heads)) * len(errors))
     axes = fig.subplots()
-    colours = style.GREY, style.VERMILION, style.BLUE, style.GREEN, style.BLACK
-    for j, (head, colour) in enumerate(zip(heads, colours, strict=False)):
+    colours = ('GREY', 'VERMILION', 'BLUE', 'GREEN', 'BLACK', 'ORANGE')
+    for j, (head, name) in enumerate(zip(heads, colours, strict=False)):
+        colour = getattr(style, name)
         for i, cases in enumerate(errors.values()):
             own = [case[j] for case in cases]
             y = i + 0.14 * (j - 0.5 * (len(heads) - 1))

@@ -38,12 +38,12 @@ except ImportError as error:
 #: steps and their time on two quiet cores [s], which the progress bar goes by
 STEPS = {
     'start': 5,
-    'excitation': 17,
+    'excitation': 9,
     'identification': 4,
-    'motions': 11,
+    'motions': 7,
     'diagnosis': 15,
-    'the same motions': 11,
-    'reports': 8,
+    'the same motions': 7,
+    'reports': 2,
     'replay': 4,
 }
 

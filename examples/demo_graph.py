@@ -37,14 +37,14 @@ STATES = {
 }
 FAILED = ('failed', 'cancelled', 'refused', 'stopped')
 AT_REST = ('idle', 'done', *FAILED)
-#: of the sample clock, in times real time
-REAL_TIME, SLOW = 1.0, 0.25
-#: of the replay; the next one is tried where samples are lost
-REPLAY = (4.0, 1.0, SLOW)
+#: of the sample clock, in times real time; the next one is tried where samples are lost
+RATES = (2.0, 1.0, 0.25)
+#: the same of the replay
+REPLAY = (4.0, 1.0, 0.25)
 #: a stream that is silent for so long has ended [s]
 QUIET = 10.0
 #: no limit of the nodes is one that a slow machine meets [s]
-PATIENT = 300.0
+PATIENT = 120.0
 
 Blocks = Mapping[str, Sequence[bytes]]
 
@@ -96,7 +96,7 @@ class Wire:
     """The blocks of some topics as their bytes come; `take` them at least every few seconds."""
 
     def __init__(self, client: Client, topics: Sequence[str]) -> None:
-        self._inputs = RawSubscriptions(client.node, topics)
+        self._client, self._inputs = client, RawSubscriptions(client.node, topics)
         self.blocks: dict[str, list[bytes]] = {topic: [] for topic in topics}
         self._samples = dict.fromkeys(topics, 0)
         self._arrival = time.monotonic()
@@ -117,7 +117,7 @@ class Wire:
         for _, topic, raw in self._inputs.arrived():
             self.blocks[topic].append(bytes(raw))
             self._samples[topic] += len(rows_of([raw]))
-            self._arrival = time.monotonic()
+            self._arrival = self._client.changed = time.monotonic()
 
     def lacks(self, n: int) -> str:
         """Return which topics lack how many of n samples; empty for none."""
@@ -144,7 +144,7 @@ class Lab:
 
     def __init__(self, nodes: Nodes, client: Client, out: Path, progress: Steps) -> None:
         self.nodes, self.client, self.out, self.progress = nodes, client, out, progress
-        self.rate = REAL_TIME
+        self.rates = [*RATES]
         #: what was asked of the nodes, as commands of ROS
         self.commands: list[str] = []
         self.reports = client.listen('report')
@@ -160,7 +160,11 @@ class Lab:
                 'identifier': {'output': str(self.out / 'reports'), 'excitation_limit': PATIENT},
                 'model': {},
                 'recorder': {},
-                'excitation': {'subscribers': 3, 'wait_limit': PATIENT},
+                'excitation': {
+                    'subscribers': 3,
+                    'wait_limit': PATIENT,
+                    'rate_factor': self.rates[0],
+                },
             }
         )
 
@@ -206,8 +210,11 @@ class Lab:
 
     def call(self, service: str, step: str, state: str = 'done') -> None:
         """Call a service, and show the progress of its node until it is in a state."""
-        node = service.rpartition('/')[0]
         self.ask(service)
+        self.wait_for(service.rpartition('/')[0], step, state)
+
+    def wait_for(self, node: str, step: str, state: str = 'done') -> None:
+        """Show the progress of a node until it has been in a state since it was asked."""
 
         def look() -> None:
             status = self.client.status(node)
@@ -218,7 +225,7 @@ class Lab:
                 share = float(status.get('progress', 0)) / 100
                 self.progress.show(STATES.get(now, step), share)
 
-        self.wait(lambda: self.client.status(node).get('state') == state, step, look)
+        self.wait(lambda: state in self.client.states(node), step, look)
 
     def call_for_report(self, service: str, step: str) -> dict[str, Any]:
         """Call a service, and return the report that it ends with."""
@@ -228,22 +235,23 @@ class Lab:
         return dict(json.loads(self.reports[-1]))
 
     def without_loss(self, step: Callable[[], tuple[Any, str]]) -> Any:
-        """Do a step in real time, and where samples are lost once more at a quarter of it."""
+        """Do a step, and where samples are lost once more at a lower rate."""
         while True:
             try:
                 result, lost = step()
             except pi.PiezoIdentError as error:
                 self.nodes.check()
-                if self.rate == SLOW or isinstance(error, pi.ConfigError):
+                if len(self.rates) == 1 or isinstance(error, pi.ConfigError):
                     raise
                 lost = str(error)
             else:
-                if lost and self.rate == SLOW:
+                if lost and len(self.rates) == 1:
                     self.progress.say(f'still lost: {lost}')
-                if not lost or self.rate == SLOW:
+                if not lost or len(self.rates) == 1:
                     return result
-            self.progress.say(f'this machine is too busy for real time: {lost}')
-            self.progress.say('once more at a quarter of the rate')
+            rate = self.rates.pop(0)
+            self.progress.say(f'this machine is too busy for {rate:g} times real time: {lost}')
+            self.progress.say(f'once more at {self.rates[0]:g} times real time')
             if self.client.status('excitation').get('state') in ('waiting', 'running'):
                 self.ask('excitation/stop')
             self.wait(
@@ -252,8 +260,7 @@ class Lab:
             )
             if self.client.status('recorder').get('state') == 'recording':
                 self.call('recorder/stop', 'start')
-            self.rate = SLOW
-            self.set('excitation', 'rate_factor', SLOW)
+            self.set('excitation', 'rate_factor', self.rates[0])
 
     def identify(self) -> tuple[None, str]:
         """Have the identifier drive the stage and learn its model."""
@@ -267,6 +274,8 @@ class Lab:
     def diagnose(self) -> None:
         """Have the identifier find what the model lacks."""
         models = self.models()
+        # they come up meanwhile
+        self.start_replay()
         report = self.call_for_report('identifier/diagnose', 'diagnosis')
         self.progress.say(f'~/diagnose: {report["sentence"]}')
         if report['effects']:
@@ -396,10 +405,10 @@ def live(out: Path, progress: Steps) -> Session:
         lab.without_loss(lab.identify)
         before = lab.without_loss(lab.play_to_diagnose)
         lab.diagnose()
+        # the identifier draws meanwhile
+        lab.ask('identifier/save')
         after = lab.without_loss(lambda: lab.play('the same motions', 'after'))
-        # they come up while the identifier draws
-        lab.start_replay()
-        lab.call('identifier/save', 'reports')
+        lab.wait_for('identifier', 'reports')
         recorded = lab.replay(after, out / 'reports' / 'diagnosis' / 'model.yaml')
         for name, code in nodes.stop().items():
             if code:

@@ -47,6 +47,8 @@ PATIENCE = 3.0
 AGAIN = 5.0
 #: a graph whose nodes, which publish diagnostics once a second, are silent for so long is dead [s]
 SILENCE = 120.0
+#: a graph in which no status changes for so long hangs [s]
+STILL = 240.0
 
 
 def own_domain() -> None:
@@ -149,7 +151,14 @@ class Nodes:
 
 
 class Client:
-    """A node that calls services, sets parameters and follows status; its thread spins it."""
+    """
+    A node that calls services, sets parameters and follows status; its thread spins it.
+
+    Attributes
+    ----------
+    changed : float
+        When a status changed last, or whatever else shows that the graph goes on.
+    """
 
     def __init__(self, name: str = 'lab_client') -> None:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -158,8 +167,9 @@ class Client:
         self._executor.add_node(self.node)
         self._clients: dict[str, Any] = {}
         self._status: dict[str, dict[str, str]] = {}
+        self._states: dict[str, list[str]] = {}
         self._end = threading.Event()
-        self._heard = time.monotonic()
+        self._heard = self.changed = time.monotonic()
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_life, PREVIEW)
         self._thread = threading.Thread(target=self._spin, name='client', daemon=True)
         self._thread.start()
@@ -235,7 +245,11 @@ class Client:
 
             def keep(message: DiagnosticStatus, node: str = node) -> None:
                 values = {pair.key: pair.value for pair in message.values}
-                self._status[node] = {**values, 'message': message.message}
+                status = {**values, 'message': message.message}
+                if status != self._status.get(node):
+                    self.changed = time.monotonic()
+                self._states.setdefault(node, []).append(values.get('state', ''))
+                self._status[node] = status
 
             self.node.create_subscription(DiagnosticStatus, f'{node}/status', keep, LATCHED)
 
@@ -243,9 +257,14 @@ class Client:
         """Return the last status of a node: state, progress, message, ..."""
         return self._status.get(node, {})
 
+    def states(self, node: str) -> list[str]:
+        """Return all states of a node since its status was forgotten."""
+        return self._states.get(node, [])
+
     def forget(self, node: str) -> None:
         """Forget the last status of a node, so that the next one is a new one."""
         self._status.pop(node, None)
+        self._states.pop(node, None)
 
     def listen(self, topic: str) -> list[str]:
         """Return the list into which the messages of a latched text topic go."""
@@ -266,12 +285,15 @@ class Client:
         Raises
         ------
         PiezoIdentError
-            When it does not hold in time, or all nodes are silent.
+            When it does not hold in time, all nodes are silent, or nothing changes any more.
         """
-        begin = self._heard = time.monotonic()
+        begin = self._heard = self.changed = time.monotonic()
         while not condition():
             look()
             now = time.monotonic()
             if now - begin > timeout or now - self._heard > SILENCE:
                 raise PiezoIdentError(f'{what}: not within {now - begin:.0f} s')
+            if now - self.changed > STILL:
+                states = ', '.join(f'{k} {v.get("state")}' for k, v in self._status.items())
+                raise PiezoIdentError(f'{what}: nothing has changed for {STILL:g} s: {states}')
             time.sleep(0.1)

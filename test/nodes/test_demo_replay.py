@@ -126,3 +126,12 @@ def test_what_is_heard_is_taken_while_anything_is_waited_for(demo):
     lab.wires[:] = [heard, heard]
     lab.wait(lambda: next(looks) == 2, 'the third look')
     assert heard.taken == 4
+
+
+def test_a_graph_that_hangs_ends_with_a_sentence(demo, monkeypatch):
+    import lab_graph
+
+    lab, *_ = demo
+    monkeypatch.setattr(lab_graph, 'STILL', 0.2)
+    with pytest.raises(pi.PiezoIdentError, match=r'ages: nothing has changed for 0\.2 s: .*stage'):
+        lab.wait(lambda: False, 'ages')

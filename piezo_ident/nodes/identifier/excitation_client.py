@@ -263,11 +263,16 @@ class ExcitationClient:
     def _starting(self) -> None:
         response = self._response('starting')
         if response is None:
-            return
+            # The answer can be lost.  The excitation took the program, so it plays no other.
+            plays = self._state not in (*_RESTING, _UNHEARD)
+            if not (self.running and plays and self._looks.is_over(self._sign, _AGAIN)):
+                return
+            self._start.remove_pending_request(self._future)
         # an excitation that refuses plays a program of someone else, which must not be stopped
-        self._phase = 'playing' if response.success else 'refused'
+        success = response is None or response.success
+        self._phase = 'playing' if success else 'refused'
         self._give_back()
-        if not response.success:
+        if not success:
             self._end(f'the excitation does not start: {response.message}')
             return
         self._begin()

@@ -120,6 +120,28 @@ def test_the_excitation_gets_its_program_back(how):
     assert client.running == (how == 'started')
 
 
+def test_a_start_whose_answer_is_lost_counts_once_the_excitation_plays(monkeypatch):
+    monkeypatch.setattr(excitation_client, '_AGAIN', 0.01)
+    node, ends, begun, nan = Node(0), [], [], float('nan')
+    client = ExcitationClient(node, lambda: Streams(0, nan, nan), lambda: '')
+    setter, _, starter, _ = node.clients
+    starter.dropped = 1
+    client.start('a program', 20.0, ends.append, lambda: begun.append(True))
+
+    def go_on():
+        until = time.monotonic() + 0.05
+        while time.monotonic() < until:
+            client.poll()
+            time.sleep(0.001)
+
+    go_on()
+    assert client.is_starting and not begun
+    client._hear(DiagnosticStatus(values=[KeyValue(key='state', value='running')]))
+    go_on()
+    assert begun == [True] and not client.is_starting and client.running and ends == []
+    assert programs(setter) == ['a program', 'mine'] and not starter.waited_for
+
+
 @pytest.mark.parametrize('is_late', [True, False])
 def test_the_last_answers_of_a_late_driver_are_waited_for(monkeypatch, is_late):
     clock, nan = [100.0], float('nan')
