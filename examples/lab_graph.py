@@ -246,7 +246,9 @@ class Client:
             def keep(message: DiagnosticStatus, node: str = node) -> None:
                 values = {pair.key: pair.value for pair in message.values}
                 status = {**values, 'message': message.message}
-                if status != self._status.get(node):
+                # counts go on although nothing does
+                before, told = self._status.get(node, {}), ('state', 'progress', 'text')
+                if any(status.get(key) != before.get(key) for key in told):
                     self.changed = time.monotonic()
                 self._states.setdefault(node, []).append(values.get('state', ''))
                 self._status[node] = status
