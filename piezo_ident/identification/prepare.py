@@ -72,14 +72,6 @@ class Excerpt:
         """Unbroken stretches of samples that count, as (start, stop)."""
         return true_runs(self.use)
 
-    @functools.cached_property
-    def joined(self) -> list[tuple[int, int]]:
-        """
-        Stretches, joined over short gaps of samples that do not count.
-
-        A regression may run through the straight line that replaces a few lost readings.
-        """
-        return true_runs(closed(self.use, FEW))
 
     @functools.cached_property
     def span(self) -> tuple[float, float]:
@@ -190,19 +182,8 @@ class Prepared:
     """
     Records ready for the steps.
 
-    Attributes
-    ----------
-    rate : float
-        Sampling rate [Hz].
-    scaling : Scaling
-    records : list of Record
-        Records without their faulty readings.
-    pieces : list of Piece
-        Pieces at this sampling rate.
-    runs : list of Run
-        Normalised pieces.
-    warnings : list of str
-        Faults of the data, and data that are left out.
+    The records lack their faulty readings.  Their pieces have one sampling rate [Hz], and the runs
+    are the pieces, normalised.  The warnings name faults of the data, and data that are left out.
     """
 
     rate: float

@@ -88,27 +88,28 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.thresholds is not None and not 2 <= self.thresholds <= 400:
-            raise ConfigError(f'thresholds must be 2 to 400, got {self.thresholds}')
-        if self.solver not in ('least_squares', 'swarm'):
-            raise ConfigError(f'solver must be least_squares or swarm, got {self.solver!r}')
-        if self.polish and self.solver != 'swarm':
-            raise ConfigError('polish applies to the swarm alone; set the solver to swarm')
-        if not 1 <= self.max_order <= 50:
-            raise ConfigError(f'max_order must be 1 to 50, got {self.max_order}')
         sizes = list(self.order or (1, 1))
-        if len(sizes) != 2 or not all(1 <= n <= 50 for n in sizes):
-            raise ConfigError(f'order must be two numbers of 1 to 50, got {self.order}')
-        if self.delay is not None and not 0 <= self.delay <= 10_000:
-            raise ConfigError(f'delay must be 0 to 10000 samples, got {self.delay}')
-        if self.swarm_size < 2:
-            raise ConfigError(f'swarm_size must be at least 2, got {self.swarm_size}')
-        if self.swarm_iterations < 1:
-            raise ConfigError(f'swarm_iterations must be positive, got {self.swarm_iterations}')
-        if self.hold_out is not None and not 0.0 < self.hold_out < float('inf'):
-            raise ConfigError(f'hold_out must be a positive time, got {self.hold_out} s')
-        if self.seed < 0:
-            raise ConfigError(f'seed must not be negative, got {self.seed}')
+        rules = {
+            'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
+            'solver': (self.solver in ('least_squares', 'swarm'), 'least_squares or swarm'),
+            'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
+            'max_order': (1 <= self.max_order <= 50, '1 to 50'),
+            'order': (
+                len(sizes) == 2 and all(1 <= n <= 50 for n in sizes),
+                'two numbers of 1 to 50',
+            ),
+            'delay': (self.delay is None or 0 <= self.delay <= 10_000, '0 to 10000 samples'),
+            'swarm_size': (self.swarm_size >= 2, 'at least 2'),
+            'swarm_iterations': (self.swarm_iterations >= 1, 'positive'),
+            'hold_out': (
+                self.hold_out is None or 0.0 < self.hold_out < float('inf'),
+                'a positive time [s]',
+            ),
+            'seed': (self.seed >= 0, 'zero or positive'),
+        }
+        for name, (is_valid, wanted) in rules.items():
+            if not is_valid:
+                raise ConfigError(f'{name} must be {wanted}, got {getattr(self, name)!r}')
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +125,7 @@ class DelayResult:
     source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
-        One-step ARX loss for d = 0, 1, ...
-    scan : int or None
-        Delay of the scan.
+        One-step ARX loss for d = 0, 1, ...; `scan` is the delay that it tells.
     """
 
     samples: int
@@ -211,22 +210,12 @@ class Steps:
 @dataclass(frozen=True)
 class ErrorRow:
     """
-    Free-run error of one stretch of data.
+    Free-run error of one stretch of data, and of the hysteresis alone.
 
-    Attributes
-    ----------
-    record, segment : str
-    percent : float
-        `piezo_ident.model.metrics.percent_of_stroke` with the stroke of the whole record.
-    static_percent : float
-        Same error for the hysteresis alone.
-    fit : float
-        `piezo_ident.model.metrics.fit_percent`.
-    n : int
-        Number of samples.
-    data : {'fitted', 'selection', 'held out', 'validation'}
-        Use of these samples: 'selection' was not fitted but chose between models, 'validation'
-        lies in a record that was given for validation.
+    `percent` and `static_percent` refer to the stroke of the whole record, `fit` is
+    `piezo_ident.model.metrics.fit_percent`, and `n` counts samples.  `data` is 'fitted',
+    'selection' (not fitted, but chose between models), 'held out', or 'validation' (of a record
+    that was given for it).
     """
 
     record: str
@@ -246,18 +235,9 @@ class ErrorRow:
 @dataclass(frozen=True)
 class Headline:
     """
-    Error of a model, and of its hysteresis alone, over the same samples.
+    Error of a model, and of its hysteresis alone, over all `n` driven samples of one kind of data.
 
-    Attributes
-    ----------
-    data : {'validation', 'held out', 'selection', 'fitted'}
-        First of these kinds that has data.
-    records : tuple of str
-        Names of the records of these data.
-    percent, static_percent : float
-        As in `ErrorRow`, over all driven samples; NaN without driven samples.
-    n : int
-        Number of samples.
+    `data` and the percentages are those of `ErrorRow`; these are NaN without samples.
     """
 
     data: str
@@ -270,20 +250,14 @@ class Headline:
 @dataclass(frozen=True, eq=False)
 class FitOutcome:
     """
-    Result of a fit, in three steps or by one free-run fit.
+    Result of a fit, in three steps or by one free-run fit; see `Identification`.
 
     Attributes
     ----------
-    model, delay, dynamics, hysteresis
-        As in `Identification`.
     masks : sequence of (fitted, selection)
         For each run, the fitted samples and the samples that only chose between models.
-    warnings : sequence of str
-    not_identified, memories
-        As in `Identification`.
     offsets : mapping
-        Distance of the zero of displacement of a run from the zero of the model [m]; keys as in
-        `memories`.
+        Distance of the zero of displacement of a run from the zero of the model [m].
     judged : (StageModel, Memories) or None
         Judged model and memories, if the final model was fitted to all data.
     fit : Fit or None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +31,9 @@ POINTS = 20
 
 def excited_band(u: Array, sample_rate: float, depth: float = 1e-3) -> float:
     """
-    Find the highest frequency at which the input still has power [Hz].
+    Find the highest frequency [Hz] at which u, shape (n,), still has power.
 
-    Parameters
-    ----------
-    u : ndarray, shape (n,)
-    sample_rate : float
-        [Hz]
-    depth : float, optional
-        Share of the largest spectral density that counts as power.
+    `depth` is the share of the largest spectral density that counts as power.
 
     Examples
     --------
@@ -62,18 +57,10 @@ def prefilter(x: Array, sample_rate: float, cutoff: float) -> Array:
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """
-    Response of an output to an input.
+    Response ``S_uy / S_uu`` of an output to an input at frequencies [Hz], all of shape (n,).
 
-    Attributes
-    ----------
-    frequency : ndarray, shape (n,)
-        [Hz]
-    response : ndarray of complex, shape (n,)
-        ``S_uy / S_uu``.
-    coherence : ndarray, shape (n,)
-        ``|S_uy|^2 / (S_uu S_yy)``.
-    std : ndarray, shape (n,)
-        Relative standard deviation of the magnitude, ``sqrt((1 - c) / (2 c L))`` for L segments.
+    The coherence is ``c = |S_uy|^2 / (S_uu S_yy)``.  The relative standard deviation of the
+    magnitude is ``sqrt((1 - c) / (2 c L))`` for L segments.
     """
 
     frequency: Array
@@ -91,20 +78,10 @@ def frequency_response(
     u: Array, y: Array, sample_rate: float, band: float | None = None
 ) -> FrequencyResponse:
     """
-    Estimate a frequency response by Welch's method.
+    Estimate the response from u to y, shape (n,), by Welch's method, up to a frequency [Hz].
 
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-        Input and output; linear trends are removed segment by segment.
-    sample_rate : float
-        [Hz]
-    band : float, optional
-        Highest frequency returned [Hz].
-
-    Notes
-    -----
-    Bendat and Piersol, Random Data, 4th ed. (2010), table 9.6, doi:10.1002/9781118032428.
+    Linear trends are removed segment by segment.  After Bendat and Piersol, Random Data, 4th ed.
+    (2010), table 9.6, doi:10.1002/9781118032428.
     """
     response = _response([(u, y)], min(_power_of_two(u.size // 16), SEGMENT), sample_rate)
     f = response.frequency
@@ -117,18 +94,9 @@ def broadband_response(
     """
     Estimate the response from the output of a hysteresis to the displacement, from any motion.
 
-    Parameters
-    ----------
-    parts : sequence of tuple of ndarray
-        Unbroken stretches of any length: voltage, output of the hysteresis, displacement.
-    sample_rate : float
-        [Hz]
-
-    Returns
-    -------
-    FrequencyResponse or None
-        Response at the frequencies that both voltage and displacement show; None if these are
-        too few, as with a single sine.
+    The parts are unbroken stretches of any length: voltage, output of the hysteresis,
+    displacement.  The result holds the frequencies that both voltage and displacement show; None
+    if these are too few, as with a single sine.
     """
     longest = max((v.size for v, _, _ in parts), default=0)
     segment = min(_power_of_two(longest // 16), SEGMENT)
@@ -203,8 +171,7 @@ def rms_above(u: Array, rate: float, edge: float) -> Array:
     return np.asarray(np.sqrt(np.maximum(power, 0.0)))
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseSegment:
+class NoiseSegment(NamedTuple):
     """Input and output of a noise segment, prefiltered to its band [Hz]; the end is held out."""
 
     fitted: tuple[Array, Array]

@@ -62,19 +62,8 @@ def find_jumps(v: Array, before: int, after: int) -> Integers:
     Find the samples at which v jumps after a quiet stretch.
 
     A jump is a difference of neighbouring samples.  It exceeds a quarter of the largest
-    difference, and twenty times every difference within the `before` samples ahead of it.
-
-    Parameters
-    ----------
-    v : ndarray, shape (n,)
-        Voltage [V].
-    before, after : int
-        Samples needed ahead of and behind a jump.
-
-    Returns
-    -------
-    ndarray of int
-        Index of the first sample after each jump.
+    difference, and twenty times every difference within the `before` samples ahead of it.  The
+    result holds the first sample behind each jump with `before` samples ahead and `after` behind.
 
     Examples
     --------
@@ -140,19 +129,7 @@ def _first_rise(mean: Array, before: int, rounding: float) -> tuple[int | None, 
 
 def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60) -> StepDelay:
     """
-    Find the pure delay from steps.
-
-    Parameters
-    ----------
-    pieces : sequence of Piece
-        Stretches that hold the steps.
-    before, after : int, optional
-        Samples ahead of and behind each step that are looked at.
-
-    Returns
-    -------
-    StepDelay
-        Its `samples` are None unless a step rises above the noise.
+    Find the pure delay from the steps in some pieces, with samples before and after each.
 
     Examples
     --------
@@ -178,15 +155,9 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     if samples is None:
         std = float('inf')
     elif n > 2:
-        left_out = [
-            _first_rise(
-                _mean(np.delete(responses, i, 0), np.delete(weight, i)),
-                before,
-                rounding,
-            )
-            for i in range(n)
-        ]
-        delays = np.array([s if s is not None else after for s, _, _ in left_out], dtype=float)
+        rest = (_mean(np.delete(responses, i, 0), np.delete(weight, i)) for i in range(n))
+        left_out = [_first_rise(mean_of_rest, before, rounding)[0] for mean_of_rest in rest]
+        delays = np.array([after if s is None else s for s in left_out], dtype=float)
         jackknife = np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))
         std = max(std, float(jackknife))
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
@@ -204,17 +175,8 @@ def delay_from_loss(loss: Array) -> int | None:
     Read the delay from a scan of the ARX loss.
 
     A model with too small a delay contains the true model if it has enough numerator
-    coefficients.  The loss therefore stays low up to the true delay and rises behind it.
-
-    Parameters
-    ----------
-    loss : ndarray, shape (n,)
-        One-step loss for d = 0, 1, ...
-
-    Returns
-    -------
-    int or None
-        None if the loss has not risen at the largest delay: the scan is then undecided.
+    coefficients.  The loss for d = 0, 1, ... therefore stays low up to the true delay and rises
+    behind it.  None if it has not risen at the largest delay: the scan is then undecided.
 
     Examples
     --------

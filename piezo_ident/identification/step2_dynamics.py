@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
 from piezo_ident.identification.solvers.output_error import lag_products
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
@@ -38,16 +37,9 @@ REFINEMENTS = 3
 @dataclass(frozen=True, eq=False)
 class ArxFactor:
     """
-    Triangular factor of the ARX data matrix.
+    Triangular factor R of the ARX data matrix, which has n rows and the columns drawn above.
 
-    Attributes
-    ----------
-    R : ndarray, shape (p, p)
-        ``p = na_max + n_lags + 1``; the columns are those of the drawing in the module.
-    n : int
-        Number of rows of the data matrix.
-    na_max : int
-        Number of lags of the output.  The lags of the input follow them, from lag 0 on.
+    `na_max` is the number of lags of the output.
     """
 
     R: Array
@@ -62,12 +54,7 @@ class ArxFactor:
         return A, scale
 
     def fit(self, na: int, nb: int, d: int) -> tuple[Array, float]:
-        """
-        Solve one order by least squares.
-
-        The solution is a_1 .. a_na, b_1 .. b_nb in one row, with the mean square of the one-step
-        prediction error.
-        """
+        """Solve one order for a_1 .. a_na, b_1 .. b_nb, with the mean square one-step error."""
         (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
         x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
         loss = float(np.sum((y - A @ x) ** 2)) / self.n
@@ -147,14 +134,8 @@ class OrderTable:
     """
     Table of all orders; arrays have shape (na_max, nb_max) with entry [na-1, nb-1].
 
-    Attributes
-    ----------
-    loss : ndarray
-        One-step loss on the fitted samples.
-    aic, bic : ndarray
-        Criteria of Akaike and of Schwarz.
-    held_out : ndarray
-        Free-run rms error on the held-out samples; infinite for an unstable model.
+    It holds the one-step loss on the fitted samples, the criteria of Akaike and of Schwarz, and
+    the free-run rms error on the held-out samples, infinite for an unstable model.
     """
 
     loss: Array
@@ -265,45 +246,21 @@ def instrumental_variables(u: Array, y: Array, start: Dynamics, d: int) -> Dynam
     are filtered by 1/A of the previous model.  This removes the bias that output noise gives to
     least squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
 
-    Parameters
-    ----------
-    u, y : ndarray, shape (n,)
-        Input and output without their means.
-    start : Dynamics
-        Least-squares model; it is made stable first.
-    d : int
-        Delay [samples].
-
-    Returns
-    -------
-    Dynamics
-        Refined model, possibly unstable: the caller judges.
+    u and y, shape (n,), have no mean; d is the delay [samples].  The start is made stable first.
+    The result may be unstable: the caller judges.
     """
-    part = Excerpt(delayed(u, d), y, np.ones(u.size, dtype=bool))
-    return instruments_of([part], start)
-
-
-def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
-    """Refine an ARX model by instrumental variables from the samples of excerpts that count."""
     na, nb = start.a.size, start.b.size
-    model = stabilised(start)
-    first = max(na, nb)
-    spans = [(e, max(a, first), b - max(a, first)) for e in excerpts for a, b in e.joined]
+    model, u, one = stabilised(start), delayed(u, d), np.ones(1)
+    at = max(na, nb)
+    n = u.size - at
     for _ in range(REFINEMENTS):
-        A, right = np.zeros((na + nb, na + nb)), np.zeros(na + nb)
-        scale = np.zeros(na + nb)
-        filtered = [_filtered(e, model) for e in excerpts]
-        of = {id(e): signals for e, signals in zip(excerpts, filtered, strict=True)}
-        for e, at, n in spans:
-            if n <= 0:
-                continue
-            yf, uf, sf = of[id(e)]
-            u_lags = (uf, at, 1.0, nb)
-            z, phi = ((sf, at - 1, -1.0, na), u_lags), ((yf, at - 1, -1.0, na), u_lags)
-            A += np.block([[_inner(x, other, n) for other in phi] for x in z])
-            right += np.concatenate([_inner(x, (yf, at, 1.0, 1), n) for x in z])[:, 0]
-            scale += np.concatenate([np.diag(_inner(x, x, n)) for x in z])
-        size = np.sqrt(scale)
+        simulated = filter_arx(model.a, model.b, u, at_rest=False)
+        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, u, simulated))
+        u_lags = (uf, at, 1.0, nb)
+        z, phi = ((sf, at - 1, -1.0, na), u_lags), ((yf, at - 1, -1.0, na), u_lags)
+        A = np.block([[_inner(x, other, n) for other in phi] for x in z])
+        right = np.concatenate([_inner(x, (yf, at, 1.0, 1), n) for x in z])[:, 0]
+        size = np.sqrt(np.concatenate([np.diag(_inner(x, x, n)) for x in z]))
         size[size == 0.0] = 1.0
         theta = np.linalg.lstsq(A / size[:, None], right / size, rcond=None)[0].astype(float)
         candidate = Dynamics(a=theta[:na], b=theta[na:])
@@ -311,9 +268,3 @@ def instruments_of(excerpts: Sequence[Excerpt], start: Dynamics) -> Dynamics:
             return candidate
         model = candidate
     return model
-
-
-def _filtered(e: Excerpt, model: Dynamics) -> list[Array]:
-    """Filter displacement, input and simulated output by 1/A."""
-    y_sim = filter_arx(model.a, model.b, e.u, at_rest=False)
-    return [filter_arx(model.a, np.ones(1), x, at_rest=False) for x in (e.x, e.u, y_sim)]

@@ -53,11 +53,7 @@ def even_thresholds(swing: float, count: int) -> Array:
     Space thresholds evenly from 0 over the excited swing, without the 0.
 
     The play at r = 0 is the linear term, so `count` operators have ``count - 1`` thresholds.
-
-    Raises
-    ------
-    IdentificationError
-        If there is no swing.
+    Raises IdentificationError if there is no swing.
 
     Examples
     --------
@@ -101,19 +97,8 @@ def factorise(
     """
     Reduce the data to the factor R of ``[offsets | G times the columns of the law | y]``.
 
-    Parameters
-    ----------
-    excerpts : sequence of Excerpt
-        Each excerpt gets an offset of its own.
-    law : HysteresisLaw, or ndarray of shape (m,)
-        Thresholds alone stand for the law of plays.
-    dynamics, delay
-        G and the delay that the plays pass.
-
-    Returns
-    -------
-    ndarray, shape (k + size + 1, k + size + 1)
-        k is the number of excerpts, size the number of columns of the law.
+    Each excerpt has an offset of its own.  Thresholds alone, shape (m,), stand for the law of
+    plays.
     """
     law = _law(law)
     rows = filtered_rows(excerpts, law, dynamics, delay)
@@ -250,14 +235,12 @@ def fit_hysteresis(
     **flight: Any,
 ) -> HysteresisFit:
     """
-    Find the weights of H from factorised data.
+    Find the weights of H from the R of `factorise`.
 
     Parameters
     ----------
     R : ndarray
-        From `factorise`.
     law : HysteresisLaw, or ndarray of shape (m,)
-        As for `factorise`.
     n : int, optional
         Number of samples behind R; only `rms` and `std` of the result depend on it.
     solver : {'least_squares', 'swarm'}
@@ -269,10 +252,7 @@ def fit_hysteresis(
     **flight
         `rng` and options of `piezo_ident.identification.solvers.particle_swarm.particle_swarm`.
 
-    Raises
-    ------
-    IdentificationError
-        If the displacement does not move in the data.
+    Raises IdentificationError if the displacement does not move in the data.
     """
     law = _law(law)
     m = law.densities

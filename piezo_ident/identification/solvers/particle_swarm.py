@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.arrays import Array, frozen_array
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel
 from scipy.optimize import OptimizeResult
 
@@ -32,10 +31,8 @@ ATTRACTION = 1.49618
 REACH = 3
 #: share of its speed that a particle keeps when a wall of the box reflects it
 BOUNCE = 0.5
-#: number of iterations between two checks of the stopping rules, and most between two callbacks
-STRETCH = 100
-#: work between two callbacks, in products of two numbers: some ten milliseconds
-WORK = 1e7
+#: iterations between two callbacks, and those over which the best value must fall
+STRETCH, PATIENCE = 100, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +47,6 @@ class Quadratic:
     g: Array
     c: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'P', frozen_array(self.P))
-        object.__setattr__(self, 'g', frozen_array(self.g))
-
     def __call__(self, x: Array) -> Array:
         """Evaluate the objective at points x, shape (..., n)."""
         quadratic = np.einsum('...i,ij,...j->...', x, self.P, x)
@@ -65,8 +58,7 @@ def _fly(
     P: Array,
     g: Array,
     c: float,
-    lower: Array,
-    upper: Array,
+    box: Array,
     X: Array,
     V: Array,
     own: Array,
@@ -86,10 +78,10 @@ def _fly(
                 velocity += ATTRACTION * random[k, 0, s, i] * (own[s, i] - X[s, i])
                 velocity += ATTRACTION * random[k, 1, s, i] * (own[leader, i] - X[s, i])
                 x = X[s, i] + velocity
-                if x < lower[i]:
-                    x, velocity = lower[i], -BOUNCE * velocity
-                elif x > upper[i]:
-                    x, velocity = upper[i], -BOUNCE * velocity
+                if x < box[0, i]:
+                    x, velocity = box[0, i], -BOUNCE * velocity
+                elif x > box[1, i]:
+                    x, velocity = box[1, i], -BOUNCE * velocity
                 X[s, i], V[s, i] = x, velocity
             f = c
             for i in range(n):
@@ -115,35 +107,27 @@ def particle_swarm(
     callback: Callable[[OptimizeResult], Any] | None = None,
 ) -> OptimizeResult:
     """
-    Minimise a quadratic inside bounds with a particle swarm.
+    Minimise a quadratic inside finite bounds, shape (n,), with a particle swarm.
 
     Parameters
     ----------
     fun : Quadratic
     lower, upper : ndarray, shape (n,)
-        Finite bounds; the swarm starts uniformly inside them.
+        The swarm starts uniformly between them.
     rng : numpy.random.Generator
         Only source of chance: the same state gives the same result.
-    swarm_size : int, optional
-    maxiter : int, optional
+    swarm_size, maxiter : int, optional
     tol : float, optional
         Stop if the best value fell by less than this share of itself over 1,000 iterations;
         0 (default) runs all iterations.
     callback : callable, optional
-        Called as ``callback(intermediate_result)`` every 100 iterations, or more often if many
-        particles or parameters make iterations slow.  A true answer ends the search with the best
-        point so far.
+        Called as ``callback(intermediate_result)`` every 100 iterations.  A true answer ends the
+        search.
 
     Returns
     -------
     scipy.optimize.OptimizeResult
-        It has ``x``, ``fun``, ``nit``, ``nfev``, ``success``, ``status``, ``message`` and
-        ``swarm_size``.
-
-    Raises
-    ------
-    ConfigError
-        If bounds are not finite or crossed, or a size is not positive.
+        It has ``x``, ``fun``, ``nit``, ``nfev`` and ``swarm_size``.
 
     Examples
     --------
@@ -152,45 +136,26 @@ def particle_swarm(
     >>> bool(abs(result.x - 0.5).max() < 1e-6)
     True
     """
-    if not np.all(np.isfinite([lower, upper])) or np.any(lower > upper):
-        raise ConfigError('swarm: every parameter needs two finite bounds, the lower one first')
-    if swarm_size < 2 or maxiter < 1:
-        raise ConfigError('swarm: needs at least 2 particles and 1 iteration')
-    # copies have one memory layout for the compiler, even if the bounds are columns of an array
-    lower, upper = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
-    n = lower.size
-    X = lower + (upper - lower) * rng.random((swarm_size, n))
-    V = (upper - lower) * (rng.random((swarm_size, n)) - 0.5) * 0.5
+    n, wide = lower.size, upper - lower
+    X = lower + wide * rng.random((swarm_size, n))
+    V = wide * (rng.random((swarm_size, n)) - 0.5) * 0.5
     own, own_f = X.copy(), fun(X)
     history = [float(own_f.min())]
-    nit, status, message = 0, 1, 'the number of iterations was reached'
-    most = max(1, int(WORK / (swarm_size * n * n)))
+    nit, box = 0, np.array([lower, upper])
 
     def result() -> OptimizeResult:
-        return OptimizeResult(
-            x=own[np.argmin(own_f)].copy(),
-            fun=float(own_f.min()),
-            nit=nit,
-            nfev=(nit + 1) * swarm_size,
-            swarm_size=swarm_size,
-            success=status <= 1,
-            status=status,
-            message=message,
-        )
+        x, f = own[np.argmin(own_f)].copy(), float(own_f.min())
+        nfev = (nit + 1) * swarm_size
+        return OptimizeResult(x=x, fun=f, nit=nit, nfev=nfev, swarm_size=swarm_size)
 
     while nit < maxiter:
-        stretch = min(most, maxiter - nit, STRETCH - nit % STRETCH)
-        random = rng.random((stretch, 2, swarm_size, n))
-        _fly(fun.P, fun.g, fun.c, lower, upper, X, V, own, own_f, random)
-        nit += stretch
+        random = rng.random((min(STRETCH, maxiter - nit), 2, swarm_size, n))
+        _fly(fun.P, fun.g, fun.c, box, X, V, own, own_f, random)
+        nit += random.shape[0]
         if callback is not None and callback(result()):
-            status, message = 2, 'stopped by the callback'
             break
-        if nit % STRETCH:
-            continue
         history.append(float(own_f.min()))
-        past = history[max(0, len(history) - 1 - 1000 // STRETCH)]
-        if nit >= 1000 and past - history[-1] < tol * abs(history[-1]):
-            status, message = 0, f'the best value fell by less than {tol:g} in 1,000 iterations'
+        past = history[-1 - PATIENCE // STRETCH :][0]
+        if nit >= PATIENCE and past - history[-1] < tol * abs(history[-1]):
             break
     return result()

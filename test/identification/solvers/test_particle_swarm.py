@@ -6,9 +6,7 @@
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import PAPER
-from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.signals import triangle
-from piezo_ident.identification.solvers import particle_swarm as swarm
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
@@ -59,33 +57,14 @@ def test_same_state_same_result_and_another_state_another():
     assert_array_equal(one.x, same.x)
     assert np.any(one.x != other.x)
     assert (one.nit, one.nfev, one.swarm_size) == (130, 131 * 11, 11)
-    assert (one.success, one.status) == (True, 1)
 
 
 def test_tolerance_stops_early():
     result = fly(tol=1e-3)
     assert result.nit < 5000
-    assert (result.success, result.status) == (True, 0)
 
 
-def test_a_large_swarm_is_asked_more_often_and_finds_the_same(monkeypatch):
-    def run(**how):
-        seen = []
-        return fly(callback=lambda state: seen.append(state.nit), **how), seen
-
-    few, _ = run(maxiter=2030, tol=1e-9)
-    monkeypatch.setattr(swarm, 'WORK', 7 * 40 * 5 * 5)
-    many, seen = run(maxiter=2030, tol=1e-9)
-    assert_array_equal(few.x, many.x)
-    assert (few.nit, few.status) == (many.nit, many.status)
-    assert np.max(np.diff(seen)) == 7 and 1000 in seen
-    # as it comes: at most ten million products between two looks, whatever the size
-    monkeypatch.undo()
-    _, seen = run(maxiter=200, swarm_size=20_000)
-    assert np.max(np.diff(seen)) * 20_000 * 5 * 5 <= 1e7
-
-
-def test_callback_stops():
+def test_callback_sees_every_hundredth_iteration_and_stops():
     seen = []
 
     def callback(state):
@@ -94,17 +73,8 @@ def test_callback_stops():
 
     result = fly(callback=callback)
     assert [nit for nit, _ in seen] == [100, 200, 300]
-    assert (result.nit, result.success) == (300, False)
-    assert result.fun == seen[-1][1]
+    assert (result.nit, result.fun) == seen[-1]
     assert np.all(np.diff([f for _, f in seen]) <= 0)
-
-
-@pytest.mark.parametrize(
-    'wrong', [{'high': np.inf}, {'low': np.nan}, {'low': 2.0}, {'swarm_size': 1}, {'maxiter': 0}]
-)
-def test_no_box_and_no_swarm_are_refused(wrong):
-    with pytest.raises(ConfigError, match='swarm'):
-        fly(**wrong)
 
 
 @pytest.fixture(scope='module')
