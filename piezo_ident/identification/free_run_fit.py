@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.fitting.free_run import fit
 from piezo_ident.fitting.stage import PARTS
 from piezo_ident.fitting.stretch import remembered, Stretch
@@ -23,14 +23,8 @@ from piezo_ident.identification.free_run_result import FreeRunFits, outcome_of
 from piezo_ident.identification.free_run_starts import Allowed, Search, UNKNOWN
 from piezo_ident.identification.hold_out import fitted_parts, MOVES
 from piezo_ident.identification.prepare import REST, Run
-from piezo_ident.identification.results import (
-    FitOutcome,
-    Progress,
-    Settings,
-)
-from piezo_ident.identification.step3_hysteresis import (
-    even_thresholds,
-)
+from piezo_ident.identification.results import FitOutcome, Progress, Settings
+from piezo_ident.identification.step3_hysteresis import even_thresholds
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.readings.suspicions import rises_first
@@ -63,11 +57,14 @@ def fit_free_run(
     """
     Fit delay, dynamics and hysteresis together.
 
-    Raises
-    ------
-    IdentificationError
-        If the fitted or the held-out samples are too few, or the voltage does not move in them.
+    Raises IdentificationError if the fitted or the held-out samples are too few, or the voltage
+    does not move in them, and ConfigError for the swarm, which fits H alone.
     """
+    if settings.solver == 'swarm':
+        raise ConfigError(
+            f'{runs[0].record}: the swarm fits H alone, so it needs segments labelled '
+            'noise and triangle; leave --solver swarm out, or label the segments'
+        )
     chosen, parts = fitted_parts(runs, settings)
     _refuse_rest(chosen, parts)
     stretches, guesses = _stretches(chosen, parts)
@@ -75,9 +72,7 @@ def fit_free_run(
     progress('delay', 1.0)
     best, candidates = search.best()
     progress('dynamics', 0.7)
-    if settings.solver != 'swarm':
-        # the swarm only finds the weights of a sum of plays
-        candidates += tuple(search.wider(best, _taus(stretches)))
+    candidates += tuple(search.wider(best, _taus(stretches)))
     best = search.at_rest(candidates)
     candidates += (best,)
     progress('dynamics', 1.0)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask, true_runs
@@ -15,18 +14,9 @@ from piezo_ident.fitting.free_run import Fit
 from piezo_ident.fitting.stage import memory_of, Stage
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
-    FitOutcome,
-    Settings,
-)
+from piezo_ident.identification.results import DelayResult, DynamicsResult, FitOutcome, Settings
 from piezo_ident.identification.spectra import broadband_response, excited_band, highest_frequency
-from piezo_ident.identification.step3_hysteresis import (
-    factorise,
-    fit_hysteresis,
-    HysteresisFit,
-)
+from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.identification.three_steps import within
 from piezo_ident.identification.warnings import only_jumps, warn_of_range, warn_of_zeros
 from piezo_ident.model.scaling import Scaling
@@ -40,17 +30,10 @@ from piezo_ident.selection.comparison import Candidate, shown_effect
 @dataclass(frozen=True, eq=False)
 class FreeRunFits:
     """
-    Fits of unlabelled records: without the held-out samples, then to all samples.
+    Fits of unlabelled records: `judged` without the held-out samples, `last` to all samples.
 
-    Attributes
-    ----------
-    chosen, parts : sequence
-        Fitted runs, and the samples of each that were not held out.
-    judged, last : Fit
-    candidates : sequence of Candidate
-        Candidates that were compared.
-    best : Candidate
-        Candidate that was chosen.
+    `chosen` are the fitted runs, `parts` the samples of each that were not held out, and `best`
+    is the one of the compared candidates that was chosen.
     """
 
     chosen: Sequence[Run]
@@ -65,22 +48,20 @@ def outcome_of(
     fits: FreeRunFits, runs: Sequence[Run], rate: float, scaling: Scaling, settings: Settings
 ) -> FitOutcome:
     """Collect model, results of the steps, starts and warnings."""
-    chosen, parts, last = fits.chosen, fits.parts, fits.last
-    hysteresis = _hysteresis_result(fits, settings)
-    model = _model(last.stage, hysteresis.hysteresis, rate, scaling, float(hysteresis.offsets[0]))
-    tested = _model(fits.judged.stage, None, rate, scaling, float(fits.judged.stage.offsets[0]))
+    chosen, parts = fits.chosen, fits.parts
+    stage, judged = fits.last.stage, fits.judged.stage
+    model, tested = (_model(each, rate, scaling) for each in (stage, judged))
     low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
     keys = [key_of(run) for run in runs]
     # two runs with the same key could not be told apart, so they keep no start
     own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
-    stage, judged = last.stage, fits.judged.stage
     memories = {key: _start(stage, i, chosen[i], model) for key, i in own.items()}
     at_test = {key: _start(judged, i, chosen[i], tested) for key, i in own.items()}
     offsets = {
         key: scaling.Y * float(judged.offsets[i] - judged.offsets[0]) for key, i in own.items()
     }
-    fitted = {id(run): mask for run, mask in zip(chosen, parts, strict=True)}
     nothing = [np.zeros(run.piece.n, dtype=bool) for run in runs]
+    fitted = dict(zip(map(id, chosen), parts, strict=True))
     masks = [(fitted.get(id(run), none), none) for run, none in zip(runs, nothing, strict=True)]
     band = max(
         excited_band(run.u[run.use] - run.u[run.use].mean(), rate, depth=1e-4) for run in chosen
@@ -99,27 +80,23 @@ def outcome_of(
         model=within(model, low, high),
         delay=delay,
         dynamics=_dynamics_result(fits, rate, band),
-        hysteresis=hysteresis,
+        hysteresis=_hysteresis_result(fits),
         masks=masks,
         warnings=warnings,
         not_identified=tuple(missing.items()),
         memories=memories,
         offsets=offsets,
         judged=(tested, at_test),
-        fit=last,
+        fit=fits.last,
     )
 
 
-def _model(
-    stage: Stage, hysteresis: Hysteresis | None, rate: float, scaling: Scaling, offset: float
-) -> StageModel:
-    effects: tuple[EffectSetting, ...] = ()
+def _model(stage: Stage, rate: float, scaling: Scaling) -> StageModel:
     seen = stage.creep > 0.0
-    if seen.any():
-        values = {'gain': stage.creep[seen].tolist(), 'time_constant': stage.taus[seen].tolist()}
-        effects = (EffectSetting('creep', values),)
-    H = _compact(stage.hysteresis) if hysteresis is None else hysteresis
-    moved = replace(scaling, y0=scaling.y0 + offset * scaling.Y)
+    values = {'gain': stage.creep[seen].tolist(), 'time_constant': stage.taus[seen].tolist()}
+    effects = (EffectSetting('creep', values),) if seen.any() else ()
+    moved = replace(scaling, y0=scaling.y0 + float(stage.offsets[0]) * scaling.Y)
+    H = _compact(stage.hysteresis)
     return StageModel(rate, moved, H, stage.dynamics, Delay(stage.delay), effects)
 
 
@@ -133,31 +110,24 @@ def _compact(H: Hysteresis) -> Hysteresis:
 
 def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
     """Convert the start of a run to the elements of the model."""
-    memory = _start_of(stage, i, run, model.hysteresis.thresholds)
-    seen = stage.creep > 0.0
-    if not seen.any():
-        return memory
-    return Start(memory, stage.lags[i][seen])
+    memory, seen = _memory(stage, i, run, model.hysteresis.thresholds), stage.creep > 0.0
+    return Start(memory, stage.lags[i][seen]) if seen.any() else memory
 
 
-def _start_of(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
+def _memory(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
     """Compute the play outputs at the start of a run."""
     widest = float(stage.law.thresholds[-1])
     return memory_of(float(run.u[0]), widest, stage.starts[i], thresholds)
 
 
-def _hysteresis_result(fits: FreeRunFits, settings: Settings) -> HysteresisFit:
-    last = fits.last
-    stage, law = last.stage, last.stage.law
-    if settings.solver == 'swarm':
-        return _swarm(stage, fits.chosen, settings)
+def _hysteresis_result(fits: FreeRunFits) -> HysteresisFit:
+    last, stage, law = fits.last, fits.last.stage, fits.last.stage.law
     errors: dict[str, float] = {}
     for c in fits.candidates:
         name = c.fit.stage.law.name
         errors[name] = min(float(np.sqrt(c.error)), errors.get(name, np.inf))
-    whole = last.covariance()[: law.size, : law.size]
     H = _compact(stage.hysteresis)
-    std = law.deviations(whole)
+    std = law.deviations(last.covariance()[: law.size, : law.size])
     used = np.isin(law.thresholds, H.thresholds)
     return HysteresisFit(
         hysteresis=H,
@@ -176,25 +146,6 @@ def _hysteresis_result(fits: FreeRunFits, settings: Settings) -> HysteresisFit:
     )
 
 
-def _swarm(stage: Stage, runs: Sequence[Run], settings: Settings) -> HysteresisFit:
-    """Fit the weights by the swarm, with G and the starts of the free-run fit."""
-    excerpts = []
-    for i, run in enumerate(runs):
-        excerpts.append(replace(run.excerpt(run.use), memory=partial(_start_of, stage, i, run)))
-    R = factorise(excerpts, stage.law, stage.dynamics, Delay(stage.delay))
-    return fit_hysteresis(
-        R,
-        stage.law,
-        sum(int(e.use.sum()) for e in excerpts),
-        solver='swarm',
-        polish=settings.polish,
-        rows=sum(e.rows for e in excerpts),
-        rng=np.random.default_rng(settings.seed),
-        swarm_size=settings.swarm_size,
-        maxiter=settings.swarm_iterations,
-    )
-
-
 def _delay_result(fits: FreeRunFits, settings: Settings, rate: float, band: float) -> DelayResult:
     d = fits.last.stage.delay
     if settings.delay is not None:
@@ -206,36 +157,20 @@ def _delay_result(fits: FreeRunFits, settings: Settings, rate: float, band: floa
 
 
 def _dynamics_result(fits: FreeRunFits, rate: float, band: float) -> DynamicsResult:
-    last = fits.last
-    stage, G = last.stage, last.stage.dynamics
-    runs, parts = fits.chosen, fits.parts
-    undone = [
-        stage.hysteresis(run.u, _start_of(stage, i, run, stage.law.thresholds))
-        for i, run in enumerate(runs)
-    ]
-    response = broadband_response(
-        [
-            (run.u[a:b], w[a:b], run.x[a:b])
-            for run, w, mask in zip(runs, undone, parts, strict=True)
-            for a, b in true_runs(run.use & mask)
-        ],
-        rate,
-    )
-    covariance = np.zeros((1, 1))
+    stage, G = fits.last.stage, fits.last.stage.dynamics
+    moved: list[tuple[Array, Array, Array]] = []
+    for i, (run, mask) in enumerate(zip(fits.chosen, fits.parts, strict=True)):
+        w = stage.hysteresis(run.u, _memory(stage, i, run, stage.law.thresholds))
+        moved += [(run.u[a:b], w[a:b], run.x[a:b]) for a, b in true_runs(run.use & mask)]
+    order, covariance = (0, 1), np.zeros((1, 1))
     if not G.is_static:
-        at = stage.law.size + stage.creep.size
-        n = G.a.size + G.b.size
-        covariance = last.covariance()[at : at + n, at : at + n]
-    whole = float(np.std(np.concatenate([run.x[run.use] for run in runs])))
+        order = G.a.size, G.b.size
+        own = stage.law.size + stage.creep.size + np.arange(sum(order))
+        covariance = fits.last.covariance()[np.ix_(own, own)]
+    whole = float(np.std(np.concatenate([run.x[run.use] for run in fits.chosen])))
     methods = {c.name: 100.0 * float(np.sqrt(c.error)) / whole for c in fits.candidates}
-    return DynamicsResult(
-        (0, 1) if G.is_static else (G.a.size, G.b.size),
-        None,
-        methods,
-        covariance,
-        response,
-        band=band,
-    )
+    response = broadband_response(moved, rate)
+    return DynamicsResult(order, None, methods, covariance, response, band=band)
 
 
 def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) -> dict[str, str]:

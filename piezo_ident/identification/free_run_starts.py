@@ -73,16 +73,9 @@ def linear_starts(
     inputs: Sequence[Array], stretches: Sequence[Stretch], allowed: Allowed, of: Sequence[int]
 ) -> dict[tuple[int, int], tuple[int, Dynamics]]:
     """
-    Find for each order the delay and the G of least squares with the smallest free-run error.
+    Find for each order na the delay and the G of least squares with the smallest free-run error.
 
-    Parameters
-    ----------
-    inputs : sequence of ndarray
-        Input of G on each stretch, normalised.
-    stretches : sequence of Stretch
-    allowed : Allowed
-    of : sequence of int
-        Orders na.
+    `inputs` are those of G on each stretch, normalised.
     """
     orders = allowed.orders(of)
     rate = stretches[0].rate
@@ -152,18 +145,10 @@ class Search:
     """
     Search for H, G and the delay on a few stretches.
 
-    Attributes
-    ----------
-    stretches : sequence of Stretch
-    sets, kinds : ndarray of int, or None for `kinds`
-        Set and kind of motion of each block, for the comparison.
-    law : HysteresisLaw
-        Law of plays alone.
-    guesses : ndarray, shape (records, PARTS)
-        First guess of the memory at the start of each record; a row of zeros is a known start.
-    allowed : Allowed
-    tick : callable
-        Called between the steps; it may raise to stop the work.
+    `sets` and `kinds` hold the set and the kind of motion of each block, for the comparison.
+    `guesses`, shape (records, PARTS), are those of the memory at the start of each record; a row
+    of zeros is a known start.  `law` is that of plays alone.  `tick` is called between the steps;
+    it may raise to stop the work.
     """
 
     stretches: Sequence[Stretch]

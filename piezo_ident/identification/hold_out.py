@@ -56,27 +56,22 @@ def fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], li
         held_time = settings.hold_out or min(share, 0.25 * piece.duration)
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
-        if n_held >= MIN_HELD and n_fit >= MIN_FIT:
-            if settings.hold_out:
-                fitted = np.arange(piece.n) < n_fit
-            else:
-                fitted = ~held_out_stretches(run.u, rate, n_held)
-            enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
-            if enough or not chosen:
-                chosen.append(run)
-                masks.append(fitted)
-        elif run is not ranked[0]:
-            continue
-        elif n_held < MIN_HELD:
+        if n_held < MIN_HELD or n_fit < MIN_FIT:
+            if chosen:
+                continue
             raise IdentificationError(
-                f'{run.record}: holding out {held_time:.3g} s leaves {n_held} samples to judge '
-                f'by; hold out at least {MIN_HELD / rate:.3g} s (--hold-out)'
+                f'{run.record}: holding out {held_time:.3g} s leaves {max(n_fit, 0)} samples to '
+                f'fit and {min(n_held, piece.n)} to judge by, where {MIN_FIT} and {MIN_HELD} are '
+                'needed; record longer, or hold out another time (--hold-out)'
             )
+        if settings.hold_out:
+            fitted = np.arange(piece.n) < n_fit
         else:
-            raise IdentificationError(
-                f'{run.record}: {piece.n} samples, of which {max(n_fit, 0)} are left to fit after '
-                f'holding out {held_time:.3g} s; record longer or hold out less (--hold-out)'
-            )
+            fitted = ~held_out_stretches(run.u, rate, n_held)
+        enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
+        if enough or not chosen:
+            chosen.append(run)
+            masks.append(fitted)
     return chosen, masks
 
 

@@ -98,7 +98,18 @@ def identify(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
-    """Learn a stage of one axis; see `piezo_ident.identify`."""
+    """Learn a stage of one axis, without the promise; see `piezo_ident.identify`."""
+    return identify_and_judge(records, settings, validation, progress, steps)[0]
+
+
+def identify_and_judge(
+    records: Sequence[Record] | Record,
+    settings: Settings | None = None,
+    validation: Sequence[Record] | Record = (),
+    progress: Progress = silent,
+    steps: Steps | None = None,
+) -> tuple[Identification, Judged]:
+    """Learn a stage of one axis, and keep what promise, band and deviations follow from."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
     expect(settings, Settings, 'identify, settings', 'give several records as a list')
@@ -112,7 +123,7 @@ def _identify(
     validation: Sequence[Record],
     progress: Progress,
     steps: Steps | None,
-) -> Identification:
+) -> tuple[Identification, Judged]:
     data = prepare(records)
     validation = [without_faults(record) for record in validation]
     runs, scaling = data.runs, data.scaling
@@ -155,20 +166,16 @@ def _identify(
         settings=settings,
         records=(*data.records, *validation),
         memories=fit.memories,
-        judged=_judged(predictions, fit),
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
     provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, runs))
-    return replace(result, model=replace(model, identification=provenance))
-
-
-def _judged(predictions: Sequence[Prediction], fit: FitOutcome) -> Judged:
-    runs = (
+    judged_runs = (
         JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)
         for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
     )
-    return Judged(tuple(runs), fit.fit)
+    result = replace(result, model=replace(model, identification=provenance))
+    return result, Judged(tuple(judged_runs), fit.fit)
 
 
 def _labelled(

@@ -72,7 +72,6 @@ class Excerpt:
         """Unbroken stretches of samples that count, as (start, stop)."""
         return true_runs(self.use)
 
-
     @functools.cached_property
     def span(self) -> tuple[float, float]:
         """Lowest and highest input of the stretches; the voltage of a lost reading is known."""

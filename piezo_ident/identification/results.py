@@ -23,7 +23,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Record
-from piezo_ident.selection.judged import Judged, Promise
+from piezo_ident.selection.judged import Promise
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = Mapping[tuple[str, float], StartLike]
@@ -316,8 +316,6 @@ class Identification(Showable):
         Fitted play outputs at the start of a piece, and creep that goes on from there; keys are
         record name and start time.
     promise : Promise or None
-    judged : Judged or None
-        What promise, band and deviations follow from; None once they are there.
 
     Examples
     --------
@@ -344,7 +342,6 @@ class Identification(Showable):
     records: tuple[Record, ...] = ()
     memories: Memories = field(default_factory=dict)
     promise: Promise | None = None
-    judged: Judged | None = None
 
     @property
     def parameters(self) -> tuple[ModelParameter, ...]:

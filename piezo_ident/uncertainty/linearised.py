@@ -18,7 +18,7 @@ from piezo_ident.fitting.stretch import Stretch
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.selection.judged import JudgedRun
+from piezo_ident.selection.judged import Judged, JudgedRun
 
 #: number of blocks of each step, and most rows of its equations (time)
 BLOCKS, MOST_ROWS = 30, 100_000
@@ -28,18 +28,18 @@ MOST_WORK = 3e8
 STEPS = 'triangle', 'noise'
 
 
-def linearised(result: Identification) -> Linearised | None:
+def linearised(result: Identification, judged: Judged) -> Linearised | None:
     """
     Linearise the free run of an identified model at its parameters.
 
     Returns None for weights of the swarm, for fitted starts of labelled records, and for records
     that would take too long.
     """
-    if result.judged is None or result.hysteresis.solver == 'swarm':
+    if result.hysteresis.solver == 'swarm':
         return None
-    if result.judged.fit is not None:
-        return Linearised.of(result.judged.fit)
-    model, runs = result.model, result.judged.runs
+    if judged.fit is not None:
+        return Linearised.of(judged.fit)
+    model, runs = result.model, judged.runs
     try:
         stage = stage_of(model, result.hysteresis.law, len(runs))
     except ModelError:

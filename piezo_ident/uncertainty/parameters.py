@@ -29,6 +29,7 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.selection.judged import Judged
 from piezo_ident.uncertainty.linearised import linearised, stage_of
 
 #: entries of a model file, below `identification`
@@ -43,10 +44,10 @@ POINTS = 100
 SAME_MODE = 0.2
 
 
-def with_deviations(result: Identification) -> Identification:
+def with_deviations(result: Identification, judged: Judged) -> Identification:
     """Add quantities and deviations to the model of an identification."""
     try:
-        fitted = linearised(result)
+        fitted = linearised(result, judged)
     except IdentificationError:
         # the deviations of the steps stay
         fitted = None

@@ -32,7 +32,7 @@ from piezo_ident.identification.results import Identification
 from piezo_ident.model.initial_memory import fit_start
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.selection.judged import JudgedRun, Promise
+from piezo_ident.selection.judged import Judged, JudgedRun, Promise
 from piezo_ident.uncertainty.band import KEY, PredictionBand
 from piezo_ident.uncertainty.calibration import Blocks, blocks_of, calibrated
 from piezo_ident.uncertainty.parameters import QUANTITIES
@@ -44,11 +44,11 @@ def with_band(model: StageModel, band: PredictionBand) -> StageModel:
     return replace(model, identification={**model.identification, KEY: band.to_dict()})
 
 
-def promised_identification(result: Identification) -> Identification:
+def promised_identification(result: Identification, judged: Judged) -> Identification:
     """Add promise and band to an identification."""
-    judged, model = result.judged, result.model
-    blocks = None if judged is None else blocks_of(model, judged.runs)
-    if blocks is None or judged is None:
+    model = result.model
+    blocks = blocks_of(model, judged.runs)
+    if blocks is None:
         return result
     band = calibrated(blocks)
     promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)

@@ -14,7 +14,7 @@ from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
-from piezo_ident.identification.identify import identify as identification_alone
+from piezo_ident.identification.identify import identify_and_judge
 from piezo_ident.identification.results import (
     Identification,
     Progress,
@@ -47,8 +47,8 @@ def identify_axis(
     records: Sequence[Record] | Record, settings: Settings | None = None, **options: Any
 ) -> Identification:
     """Identify a stage of one axis, with the band and the promise; see `identify`."""
-    result = identification_alone(records, settings, **options)
-    return replace(promised_identification(with_deviations(result)), judged=None)
+    result, judged = identify_and_judge(records, settings, **options)
+    return promised_identification(with_deviations(result, judged), judged)
 
 
 def diagnose_axis(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from paper_stage import PAPER
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
@@ -190,12 +190,6 @@ def test_slow_motion_of_many_sizes_tells_a_long_delay():
     assert list(dict(result.not_identified)) == ['dynamics']
 
 
-def test_the_swarm_fits_a_sum_of_plays_where_a_wider_law_errs_less():
-    (piece,) = record_of(np.concatenate([sine(1.0), 0.5 * sine(1.0)])).pieces
-    bent = replace(piece, y=piece.y - 0.2 * piece.y**2 / np.ptp(piece.y))
-    few = {'thresholds': 10, 'order': (2, 2), 'delay': 2}
-    laws = [
-        identify(Record((bent,), 'bent'), Settings(**few, solver=solver, swarm_iterations=200))
-        for solver in ('least_squares', 'swarm')
-    ]
-    assert [result.hysteresis.law != 'plays' for result in laws] == [True, False]
+def test_the_swarm_needs_labels():
+    with pytest.raises(ConfigError, match='label'):
+        identify(slow_record(3), Settings(solver='swarm'))

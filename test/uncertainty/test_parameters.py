@@ -11,7 +11,7 @@ from paper_stage import STAGE
 from piezo_ident import report
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.fitting.jackknife import deviations, SHARE
-from piezo_ident.identification.identify import identify
+from piezo_ident.identification.identify import identify_and_judge
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.front_door import ModelParameter
@@ -34,7 +34,7 @@ segments:
 @functools.cache
 def identified():
     record = STAGE.play(parse_program(PROGRAM))
-    return identify(record, Settings(order=(10, 10), thresholds=10))
+    return identify_and_judge(record, Settings(order=(10, 10), thresholds=10))
 
 
 def test_replicates_of_a_mean_give_its_deviation():
@@ -47,7 +47,7 @@ def test_replicates_of_a_mean_give_its_deviation():
 
 
 def test_the_deviations_are_about_as_large_as_the_errors():
-    result = with_deviations(identified())
+    result = with_deviations(*identified())
     rows = result.model.quantities
     truth = quantities_of(STAGE.model, result)
     assert [p.name for p in truth] == [p.name for p in rows]
@@ -63,7 +63,7 @@ def test_the_deviations_are_about_as_large_as_the_errors():
 
 
 def test_deviations_are_in_the_parameters_the_file_the_json_and_the_summary():
-    result = with_deviations(identified())
+    result = with_deviations(*identified())
     model = model_from_dict(model_to_dict(result.model))
     assert (
         model.quantities == result.model.quantities == result.parameters[-len(model.quantities) :]
@@ -86,19 +86,18 @@ def test_a_parameter_that_the_data_do_not_know_says_so():
 
 
 def test_what_no_linear_fit_describes_keeps_the_deviations_of_its_steps():
-    result = identified()
-    assert linearised(replace(result, judged=None)) is None
-    assert linearised(replace(result, memories={('r', 0.0): None})) is None
+    result, judged = identified()
+    assert linearised(replace(result, memories={('r', 0.0): None}), judged) is None
     swarm = replace(result, hysteresis=replace(result.hysteresis, solver='swarm'))
-    assert with_deviations(swarm) is swarm
+    assert with_deviations(swarm, judged) is swarm
 
 
 @pytest.mark.parametrize('factor', [3.0])
 def test_more_noise_makes_larger_deviations(factor):
     sensor = replace(STAGE.sensor, noise_rms=factor * 10 * STAGE.sensor.noise_rms)
     record = replace(STAGE, sensor=sensor).play(parse_program(PROGRAM))
-    noisy = with_deviations(identify(record, Settings(order=(10, 10), thresholds=10)))
-    quiet = with_deviations(identified())
+    noisy = with_deviations(*identify_and_judge(record, Settings(order=(10, 10), thresholds=10)))
+    quiet = with_deviations(*identified())
     ratios = [
         a.std / b.std
         for a, b in zip(noisy.model.quantities, quiet.model.quantities, strict=False)
