@@ -40,8 +40,6 @@ from piezo_ident.identification.prepare import (
 )
 from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
     FitOutcome,
     Identification,
     Progress,
@@ -49,9 +47,10 @@ from piezo_ident.identification.results import (
     silent,
     Steps,
 )
-from piezo_ident.identification.slow_part import without_pairs
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import lag_of, with_starts
+from piezo_ident.identification.step1_delay import DelayResult
+from piezo_ident.identification.step2_dynamics import DynamicsResult, without_pairs
 from piezo_ident.identification.step3_choice import third_step, WORTH
 from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
 from piezo_ident.identification.three_steps import (

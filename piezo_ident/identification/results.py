@@ -6,16 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Mask
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.showable import Showable
 from piezo_ident.fitting.free_run import Fit
-from piezo_ident.identification.spectra import FrequencyResponse
-from piezo_ident.identification.step1_delay import StepDelay
-from piezo_ident.identification.step2_dynamics import OrderTable
+from piezo_ident.identification.step1_delay import DelayResult
+from piezo_ident.identification.step2_dynamics import DynamicsResult
 from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.model.metrics import KINDS
@@ -110,86 +109,6 @@ class Settings:
         for name, (is_valid, wanted) in rules.items():
             if not is_valid:
                 raise ConfigError(f'{name} must be {wanted}, got {getattr(self, name)!r}')
-
-
-@dataclass(frozen=True, eq=False)
-class DelayResult:
-    """
-    Result of step 1.
-
-    Attributes
-    ----------
-    samples : int
-    std : float
-        Standard deviation [samples]; infinite if it is unknown.
-    source : {'steps', 'scan', 'free run', 'given', 'none'}
-    step : StepDelay or None
-    loss : ndarray or None
-        One-step ARX loss for d = 0, 1, ...; `scan` is the delay that it tells.
-    """
-
-    samples: int
-    std: float
-    source: str
-    step: StepDelay | None = None
-    loss: Array | None = None
-    scan: int | None = None
-
-    @property
-    def agree(self) -> bool | None:
-        """Whether steps and scan agree within a sample; None if one of them is missing."""
-        if self.step is None or self.step.samples is None or self.scan is None:
-            return None
-        return abs(self.step.samples - self.scan) <= 1
-
-    @property
-    def unknown(self) -> DelayResult:
-        """Same steps and scan with a delay of 0, for a model that errs less without a delay."""
-        return replace(self, samples=0, std=float('inf'), source='none')
-
-
-@dataclass(frozen=True, eq=False)
-class DynamicsResult:
-    """
-    Result of step 2.
-
-    Attributes
-    ----------
-    order : tuple of int
-        (na, nb); (0, 1) stands for G = 1.
-    table : OrderTable or None
-        Least squares at every order, after the hysteresis was undone.
-    methods : dict of str to float
-        Held-out free-run error of least squares, instrumental variables and output error at the
-        chosen order, in % of the rms of the held-out output; infinite if unstable.
-    covariance : ndarray, shape (na + nb, na + nb)
-        Covariance of (a, b).
-    response : FrequencyResponse or None
-        Measured response, normalised: from voltage to displacement on a noise segment, else from
-        the output of H to displacement on any broadband motion.
-    bias : float
-        Mean voltage of the measured noise, normalised.
-    slope_measured, slope_model : float
-        Small-signal gain of the measured displacement at this bias, and of H, normalised.
-    band : float
-        Highest frequency with power in the input [Hz].
-    """
-
-    order: tuple[int, int]
-    table: OrderTable | None
-    methods: dict[str, float]
-    covariance: Array
-    response: FrequencyResponse | None = None
-    bias: float = float('nan')
-    slope_measured: float = float('nan')
-    slope_model: float = float('nan')
-    band: float = float('nan')
-
-    @property
-    def known_to(self) -> float:
-        """Highest frequency with power in the input, or with a measured response [Hz]."""
-        measured = () if self.response is None else self.response.frequency
-        return float(np.fmax.reduce(measured, initial=self.band))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,16 +6,22 @@ Step 1: find the pure delay from steps, and check it by a scan of the ARX loss.
 
 The step responses are divided by the signed height of their steps and averaged.  The delay is the
 first sample at which the average leaves the noise.  The scan fits ARX models with every delay to
-the noise record.  Its delay is the largest that does not raise the loss.
+the noise record.  Its delay is the largest that does not raise the loss.  A free run over the
+noise decides between both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, interpolated
+from piezo_ident.identification.step2_dynamics import (
+    arx_factor,
+    free_run_error,
+    instrumental_variables,
+)
 from piezo_ident.record.record import Piece
 
 #: the average response counts as risen at this many standard deviations of its noise
@@ -24,6 +30,17 @@ THRESHOLD = 5.0
 EQUAL = 0.02
 #: number of delays [samples] that the scan tries, and the orders na = nb of its models
 MAX_DELAY, SCAN_ORDER = 30, 8
+
+#: orders (n, n) that are tried, and delays [samples] that are tried below the delays in question
+CHECK_ORDERS = (4, 8, 12)
+CHECK_DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
+#: errors within this share of the smallest error count as equal to it
+SLACK = 0.05
+#: largest error of the best free run, as a share of the motion, at which it may decide the delay
+#: that neither steps nor scan tell
+FOLLOWS = 0.5
+
+Signals = tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +72,42 @@ class StepDelay:
     threshold: float
     lag: Integers
     response: Array
+
+
+@dataclass(frozen=True, eq=False)
+class DelayResult:
+    """
+    Result of step 1.
+
+    Attributes
+    ----------
+    samples : int
+    std : float
+        Standard deviation [samples]; infinite if it is unknown.
+    source : {'steps', 'scan', 'free run', 'given', 'none'}
+    step : StepDelay or None
+    loss : ndarray or None
+        One-step ARX loss for d = 0, 1, ...; `scan` is the delay that it tells.
+    """
+
+    samples: int
+    std: float
+    source: str
+    step: StepDelay | None = None
+    loss: Array | None = None
+    scan: int | None = None
+
+    @property
+    def agree(self) -> bool | None:
+        """Whether steps and scan agree within a sample; None if one of them is missing."""
+        if self.step is None or self.step.samples is None or self.scan is None:
+            return None
+        return abs(self.step.samples - self.scan) <= 1
+
+    @property
+    def unknown(self) -> DelayResult:
+        """Same steps and scan with a delay of 0, for a model that errs less without a delay."""
+        return replace(self, samples=0, std=float('inf'), source='none')
 
 
 def find_jumps(v: Array, before: int, after: int) -> Integers:
@@ -185,3 +238,44 @@ def delay_from_loss(loss: Array) -> int | None:
     """
     low = np.flatnonzero(loss <= (1.0 + EQUAL) * loss.min())
     return int(low[-1]) if low[-1] < loss.size - 1 else None
+
+
+def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
+    """
+    Choose the delay of steps or of the scan that a free run over noise supports, else another.
+
+    Steps and scan give too large a delay if the displacement starts slowly or the noise is not
+    white.  G can make up for a delay that is too small, but not for one that is too large.
+    A delay holds if its free run errs no more than the best.  The smaller of two delays that hold
+    is chosen.  If neither holds, half of the largest delay that holds is chosen.  A result without
+    source stays unchanged if the largest delay holds, and either a delay of 0 does not or no
+    model follows the noise.  `fitted` is input and output of noise, `held` the noise right behind
+    it that judges.
+    """
+    # a result without source holds only the largest delay of the scan
+    told = result.samples if result.source != 'none' else None
+    asked = [d for d in (told, result.scan) if d is not None]
+    most = max(asked, default=result.samples)
+    tried = sorted({*asked, most, *(d for d in CHECK_DELAYS if d < most)})
+    u, y = fitted
+    factor = arx_factor(u, y, max(CHECK_ORDERS), max(CHECK_ORDERS) + tried[-1])
+    # judge behind the fitted noise, so that long ringing has died away
+    v, x = (np.concatenate(pair) for pair in zip(fitted, held, strict=True))
+    errors = []
+    for d in tried:
+        models = [factor.dynamics(n, n, d) for n in CHECK_ORDERS]
+        models += [instrumental_variables(u, y, model, d) for model in models]
+        errors.append(min(free_run_error(model, d, v, x, u.size) for model in models))
+    least = min(errors)
+    hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
+    if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
+        # the delay may be larger, or no model follows the noise
+        return result
+    samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
+    if samples == told:
+        return result
+    if samples == result.scan:
+        # the loss was scanned in whole samples
+        return replace(result, samples=samples, std=0.5, source='scan')
+    std = max(hold[-1], 1) / np.sqrt(12.0)
+    return replace(result, samples=samples, std=std, source='free run')

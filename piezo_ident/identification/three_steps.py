@@ -20,10 +20,8 @@ import functools
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.delay_check import checked_delay
 from piezo_ident.identification.prepare import Excerpt, Run
-from piezo_ident.identification.results import DelayResult, DynamicsResult, Progress, Settings
-from piezo_ident.identification.slow_part import fast_part
+from piezo_ident.identification.results import Progress, Settings
 from piezo_ident.identification.solvers.output_error import output_error, simulation_error
 from piezo_ident.identification.spectra import (
     band_of,
@@ -33,8 +31,10 @@ from piezo_ident.identification.spectra import (
     NoiseSegment,
 )
 from piezo_ident.identification.step1_delay import (
+    checked_delay,
     delay_from_loss,
     delay_from_steps,
+    DelayResult,
     MAX_DELAY,
     no_step,
     SCAN_ORDER,
@@ -42,7 +42,9 @@ from piezo_ident.identification.step1_delay import (
 from piezo_ident.identification.step2_dynamics import (
     arx_factor,
     delayed,
+    DynamicsResult,
     factor_of,
+    fast_part,
     free_run_error,
     instrumental_variables,
     scan_orders,

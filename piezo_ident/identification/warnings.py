@@ -12,12 +12,9 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.identification.errors import Prediction
 from piezo_ident.identification.hold_out import MOVES
 from piezo_ident.identification.prepare import Excerpt, Run
-from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
-    Identification,
-)
-from piezo_ident.identification.step1_delay import no_step
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.step1_delay import DelayResult, no_step
+from piezo_ident.identification.step2_dynamics import DynamicsResult
 from piezo_ident.identification.step3_choice import PAPER_COUNT
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.scaling import Scaling

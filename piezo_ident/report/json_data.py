@@ -27,12 +27,9 @@ from piezo_ident.selection.judged import Promise
 if TYPE_CHECKING:
     from piezo_ident.control.inverse import Inverse
     from piezo_ident.diagnosis.results import Diagnosis, Errors, FoundParameter
-    from piezo_ident.identification.results import (
-        DelayResult,
-        DynamicsResult,
-        Identification,
-        Steps,
-    )
+    from piezo_ident.identification.results import Identification, Steps
+    from piezo_ident.identification.step1_delay import DelayResult
+    from piezo_ident.identification.step2_dynamics import DynamicsResult
 
     One = Identification | Diagnosis | FreeRun | Inverse | Record
     Shown = One | EachAxis[Any]

@@ -5,14 +5,8 @@
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.identification.results import (
-    DelayResult,
-    ErrorRow,
-    Identification,
-    Settings,
-    Steps,
-)
-from piezo_ident.identification.step1_delay import StepDelay
+from piezo_ident.identification.results import ErrorRow, Identification, Settings, Steps
+from piezo_ident.identification.step1_delay import DelayResult, StepDelay
 import pytest
 
 

@@ -9,12 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
-from piezo_ident.identification.results import (
-    DelayResult,
-    DynamicsResult,
-    Identification,
-    rms_percent,
-)
+from piezo_ident.identification.results import Identification, rms_percent
+from piezo_ident.identification.step1_delay import DelayResult
+from piezo_ident.identification.step2_dynamics import DynamicsResult
 from piezo_ident.model.free_run import PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.figures.delay_and_dynamics import (
