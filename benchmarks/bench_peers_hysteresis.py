@@ -33,7 +33,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.model.metrics import FORMULA, percent_of_stroke
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Record

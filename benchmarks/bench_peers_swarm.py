@@ -25,6 +25,7 @@ from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import prepare
 from piezo_ident.identification.solvers.least_squares import bounded_least_squares
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
+from piezo_ident.identification.step2_dynamics import triangle_excerpts
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     factorise,
@@ -32,7 +33,6 @@ from piezo_ident.identification.step3_hysteresis import (
     P2_BOX,
     WEIGHT_BOX,
 )
-from piezo_ident.identification.three_steps import triangle_excerpts
 from piezo_ident.model.simulated_stage import SimulatedStage
 from scipy.optimize import differential_evolution
 from side_by_side import markdown, ratio, seconds, show, take_turns, Turn

@@ -21,7 +21,8 @@ import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.settings import Settings
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.simulated_stage import SimulatedStage

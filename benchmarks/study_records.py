@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record, Segment
 from truths import (

@@ -26,7 +26,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis import diagnose
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.model.stage_model import StageModel

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
     from piezo_ident.export.fmu import export_fmu
-    from piezo_ident.identification.results import Identification, Settings
+    from piezo_ident.identification.results import Identification
+    from piezo_ident.identification.settings import Settings
     from piezo_ident.live.guard import Guard, GuardSettings
     from piezo_ident.model.free_run import FreeRun
     from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel
@@ -76,7 +77,7 @@ _HOMES = {
     'PiezoIdentError': 'common.errors',
     'Program': 'excitation.program',
     'Record': 'record.record',
-    'Settings': 'identification.results',
+    'Settings': 'identification.settings',
     'SimulatedStage': 'model.simulated_stage',
     'StageModel': 'model.stage_model',
     'TwoAxisStage': 'model.two_axis_stage',

@@ -17,7 +17,7 @@ from typing import Any, TYPE_CHECKING
 from piezo_ident.common.errors import printable
 
 if TYPE_CHECKING:
-    from piezo_ident.identification.results import Progress
+    from piezo_ident.identification.settings import Progress
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from piezo_ident.cli.files import check_bag_options, expand, options_of
 from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.common.files import write_text
 from piezo_ident.diagnosis.results import DiagnosisSettings
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.many.outliers import stand_out
 from piezo_ident.many.run import Diagnose, Identify, run_many, Task
 from piezo_ident.many.table import columns_of, csv_text, Row, unit_of, Value

@@ -28,7 +28,8 @@ from piezo_ident.cli.files import (
 )
 from piezo_ident.cli.options import READING
 from piezo_ident.common.errors import ConfigError, DataError, naming
-from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.settings import Settings
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sine_errors, SineError
 from piezo_ident.record.record import Record

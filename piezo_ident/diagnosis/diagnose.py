@@ -53,7 +53,7 @@ from piezo_ident.diagnosis.verdict import (
 )
 from piezo_ident.effects import catalogue
 from piezo_ident.identification.prepare import filled_in, same_rate
-from piezo_ident.identification.results import Progress, silent
+from piezo_ident.identification.settings import Progress, silent
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.faults import without_faults

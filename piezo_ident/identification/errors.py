@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import Run, runs_of
+from piezo_ident.identification.prepare import Excerpt, Run, runs_of
 from piezo_ident.identification.results import ErrorRow, Memories
 from piezo_ident.identification.spectra import high_passed
 from piezo_ident.identification.step3_hysteresis import factorise, fine_thresholds, fit_hysteresis
@@ -128,20 +128,23 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
     return residual_noise_floor(parts, all_stretches(parts))
 
 
+def with_fine_plays(model: StageModel, excerpts: Sequence[Excerpt]) -> StageModel:
+    """Refit H with many plays: a few err on small loops, and thereby on fast motion."""
+    swing = max(e.swing for e in excerpts)
+    r = fine_thresholds(swing, swing / 10.0)
+    R = factorise(excerpts, r, model.dynamics, model.delay)
+    return replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
+
+
 def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float, float]:
     """
     Compute the error on fast motion with a fine H, and the fast motion itself.
 
-    Both are rms values in % of stroke.  A few plays err on small loops, and thereby on fast
-    motion.  A diagnosis fits a fine H of its own, so this error uses a fine H, too.  A high-pass
-    removes a moved zero and creep.
+    Both are rms values in % of stroke.  A diagnosis fits a fine H of its own, so this error uses a
+    fine H, too.  A high-pass removes a moved zero and creep.
     """
     if law == 'plays':
-        excerpts = [run.excerpt(run.use) for run in runs]
-        swing = max(e.swing for e in excerpts)
-        r = fine_thresholds(swing, swing / 10.0)
-        R = factorise(excerpts, r, model.dynamics, model.delay)
-        model = replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
+        model = with_fine_plays(model, [run.excerpt(run.use) for run in runs])
     predictions = predictions_of(model, runs)
     stroke_of = strokes((p.run.record, p.run.piece.y) for p in predictions)
 

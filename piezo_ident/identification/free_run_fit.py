@@ -23,7 +23,8 @@ from piezo_ident.identification.free_run_result import FreeRunFits, outcome_of
 from piezo_ident.identification.free_run_starts import Allowed, Search, UNKNOWN
 from piezo_ident.identification.hold_out import fitted_parts, MOVES
 from piezo_ident.identification.prepare import REST, Run
-from piezo_ident.identification.results import FitOutcome, Progress, Settings
+from piezo_ident.identification.results import FitOutcome
+from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.step3_hysteresis import even_thresholds
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.hysteresis_law import HysteresisLaw

@@ -14,7 +14,8 @@ from piezo_ident.fitting.free_run import Fit
 from piezo_ident.fitting.stage import memory_of, Stage
 from piezo_ident.identification.errors import key_of
 from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import FitOutcome, Settings
+from piezo_ident.identification.results import FitOutcome
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.spectra import broadband_response, excited_band, highest_frequency
 from piezo_ident.identification.step1_delay import DelayResult
 from piezo_ident.identification.step2_dynamics import DynamicsResult

@@ -21,8 +21,8 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.free_run import Fit, fit
 from piezo_ident.fitting.stage import MOST_CREEP, Stage
 from piezo_ident.fitting.stretch import delayed, Stretch
+from piezo_ident.identification.solvers.arx import factor_of, stabilised
 from piezo_ident.identification.step1_delay import MAX_DELAY
-from piezo_ident.identification.step2_dynamics import factor_of, stabilised
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect

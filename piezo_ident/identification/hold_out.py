@@ -18,7 +18,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.prepare import Run
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.spectra import HIGH_PASS, rms_above
 
 #: smallest number of samples at the end of an unlabelled record that gives an error

@@ -12,8 +12,7 @@ doi:10.1109/TMECH.2015.2465868.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from platform import python_version
 from typing import Any
 
@@ -22,67 +21,42 @@ from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.identification.errors import (
     errors_of,
     fast_error,
-    fitted_memories,
-    moves_on,
     noise_floor_of,
     Prediction,
     predictions_of,
-    squares_left,
     validation_errors,
 )
 from piezo_ident.identification.free_run_fit import fit_free_run
 from piezo_ident.identification.prepare import (
-    Excerpt,
     fault_lines,
     filled_in,
     prepare,
     Run,
 )
 from piezo_ident.identification.refusals import refuse_delay
-from piezo_ident.identification.results import (
-    FitOutcome,
-    Identification,
-    Progress,
-    Settings,
-    silent,
-    Steps,
-)
+from piezo_ident.identification.results import FitOutcome, Identification, Steps
+from piezo_ident.identification.settings import Progress, Settings, silent
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
-from piezo_ident.identification.starts import lag_of, with_starts
-from piezo_ident.identification.step1_delay import DelayResult
-from piezo_ident.identification.step2_dynamics import DynamicsResult, without_pairs
-from piezo_ident.identification.step3_choice import third_step, WORTH
-from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
-from piezo_ident.identification.three_steps import (
-    beside_law,
-    first_step,
-    model_of,
-    motion_excerpts,
+from piezo_ident.identification.starts import with_starts
+from piezo_ident.identification.step1_delay import first_step
+from piezo_ident.identification.step2_dynamics import (
     second_step,
-    small_excerpts,
-    triangle_excerpts,
-    within,
+)
+from piezo_ident.identification.three_steps import (
+    fit_three_steps,
 )
 from piezo_ident.identification.warnings import (
-    warn_of_delay,
     warn_of_shape,
-    warn_of_thresholds,
-    warn_of_triangle,
     warnings_of,
 )
 from piezo_ident.model.metrics import FORMULA, percent
-from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.operators.dynamics import Delay
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record, records_of
 from piezo_ident.selection.judged import Judged, JudgedRun
 from scipy import __version__ as scipy_version
 
-#: a model without a pair of poles and zeros that H may replace may err more by this share
-AS_WELL = 0.01
-#: largest orders that are tried besides `Settings.max_order` if G has such a pair
-SMALLER = (8, 4)
 _UNLABELLED = (
     '{}: no segments are labelled {}; drive the stage with the program identification, or '
     'identify unlabelled data in one go'
@@ -132,7 +106,7 @@ def _identify(
 
     def fitted(runs: Sequence[Run]) -> FitOutcome:
         if data.labelled:
-            return _labelled(runs, data.rate, scaling, settings, progress, steps or Steps())
+            return fit_three_steps(runs, data.rate, scaling, settings, progress, steps or Steps())
         return fit_free_run(runs, data.rate, scaling, settings, progress)
 
     def predicted(fit: FitOutcome) -> tuple[StageModel, list[Prediction]]:
@@ -175,123 +149,6 @@ def _identify(
     )
     result = replace(result, model=replace(model, identification=provenance))
     return result, Judged(tuple(judged_runs), fit.fit)
-
-
-def _labelled(
-    runs: Sequence[Run],
-    rate: float,
-    scaling: Scaling,
-    settings: Settings,
-    progress: Progress,
-    steps: Steps,
-) -> FitOutcome:
-    started, steps = with_starts(runs), steps.beside(settings.delay)
-    delay_result = steps.delay or first_step(started, settings, progress)
-    delay = Delay(delay_result.samples)
-    fitter = _LabelledFitter(runs, rate, scaling, settings, progress, delay)
-    second = steps.dynamics or second_step(started, delay, settings, progress)
-    best = fitter.without_pairs(fitter.fitted(*second, lean=False), started)
-    best, delay_result, missing = fitter.with_useful_dynamics(best, delay_result)
-    runs, model = best.runs, best.model
-    span = min(e.span[0] for e in best.fit), max(e.span[1] for e in best.fit)
-    warnings = [*warn_of_thresholds(best.held, settings.thresholds), *warn_of_delay(delay_result)]
-    if outside := warn_of_triangle(*span, scaling):
-        warnings += outside
-        model = within(model, *span)
-    kinds = ('triangle', 'noise', 'settle', 'step')
-    masks = [(run.mask(*kinds) & ~(out := run.held_out()), out) for run in runs]
-    results = model, delay_result, best.dynamics, best.hysteresis
-    memories = fitted_memories(runs, model)
-    return FitOutcome(*results, masks, warnings, tuple(missing.items()), memories)
-
-
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """Results of the second and the third step, and the squares left on the selection data."""
-
-    runs: Sequence[Run]
-    fit: Sequence[Excerpt]
-    held: Sequence[Excerpt]
-    dynamics: DynamicsResult
-    hysteresis: HysteresisFit
-    model: StageModel
-    left: float
-
-
-@dataclass(frozen=True, eq=False)
-class _LabelledFitter:
-    """Third step on labelled runs, and its comparisons; the runs have no fitted starts yet."""
-
-    runs: Sequence[Run]
-    rate: float
-    scaling: Scaling
-    settings: Settings
-    progress: Progress
-    delay: Delay
-
-    def fitted(self, dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
-        """Fit the starts and H with this G; G is refined if H is not a sum of plays."""
-        settings, progress, delay = self.settings, self.progress, self.delay
-        # fit the starts again with the lag of this G
-        runs = with_starts(self.runs, lag_of(G, delay))
-        fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-        small = small_excerpts(runs)
-        fitted_to: Sequence[Excerpt] = fit
-        hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
-        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
-        if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
-            motion = motion_excerpts(runs)
-            other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
-            left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
-            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
-                hysteresis, fitted_to = other, motion
-        if hysteresis.law != 'plays':
-            # G was found with plays
-            refined = beside_law(runs, hysteresis.hysteresis, dynamics, G, delay, lean)
-            if refined is not None:
-                dynamics, G = refined
-                hysteresis = fit_again(hysteresis, fitted_to, G, delay)
-        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
-        return _Fitted(runs, fit, held, dynamics, hysteresis, model, squares_left(model, runs))
-
-    def without_pairs(self, best: _Fitted, started: Sequence[Run]) -> _Fitted:
-        """Replace a model whose G holds pairs that H may replace, if a smaller G errs no more."""
-        G, settings = best.model.dynamics, self.settings
-        if without_pairs(G, self.rate).a.size == G.a.size:
-            return best
-        sizes = [n for n in SMALLER if n < settings.max_order and not settings.order]
-        candidates = [best]
-        for size in (settings.max_order, *sizes):
-            of_size = replace(settings, max_order=size)
-            # no model of so low an order need be stable
-            with suppress(IdentificationError):
-                second = second_step(started, self.delay, of_size, self.progress, lean=True)
-                candidates.append(self.fitted(*second, lean=True))
-        # H may replace the pair, and large orders fit the error of H on the noise
-        limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in candidates)
-        return next((one for one in reversed(candidates) if one.left < limit), best)
-
-    def with_useful_dynamics(
-        self, best: _Fitted, delay_result: DelayResult
-    ) -> tuple[_Fitted, DelayResult, dict[str, str]]:
-        """Drop G and the delay if the model errs less without them; the reasons by their names."""
-        is_given = delay_result.source == 'given'
-        delay = self.delay if is_given else Delay(0)
-        without = replace(best.model.without_dynamics(), delay=delay)
-        left = squares_left(without, best.runs)
-        if best.left <= left:
-            return best, delay_result, {}
-        reason = (
-            f'with {"it" if is_given else "both"} the model errs {np.sqrt(best.left / left):.4g} '
-            'times as much on the data that choose as without; record noise of larger amplitude'
-        )
-        missing = dict.fromkeys(('dynamics',) if is_given else ('delay', 'dynamics'), reason)
-        G = Dynamics.unit()
-        dynamics = replace(best.dynamics, order=(0, 1), covariance=np.zeros((1, 1)))
-        hysteresis = third_step(best.fit, best.held, G, delay, self.settings, self.progress)
-        model = model_of(self.rate, self.scaling, hysteresis, G, delay)
-        best = replace(best, dynamics=dynamics, hysteresis=hysteresis, model=model)
-        return best, delay_result if is_given else delay_result.unknown, missing
 
 
 def first_steps(

@@ -43,17 +43,11 @@ MOST_SAMPLES = 40_000_000
 @dataclass(frozen=True, eq=False)
 class Excerpt:
     """
-    Input and output of a fit, with a mask of the samples that count.
+    Normalised input and displacement of a fit, shape (n,), and a mask of the samples that count.
 
-    Attributes
-    ----------
-    u, x : ndarray, shape (n,)
-        Normalised input and displacement; plays and dynamics need the whole input.
-    use : ndarray of bool, shape (n,)
-        Samples that count.
-    memory : callable, optional
-        Play outputs before the first sample, as a function of the thresholds.  By default they
-        are the outputs of a stage that last came down to the lowest voltage.
+    Plays and dynamics need the whole input.  `memory` gives the play outputs before the first
+    sample as a function of the thresholds.  By default they are those of a stage that last came
+    down to the lowest voltage.
     """
 
     u: Array
@@ -85,11 +79,7 @@ class Excerpt:
 
     @functools.cached_property
     def averaged(self) -> list[tuple[int, int]]:
-        """
-        Stretches whose rows are averaged, joined over gaps shorter than a row.
-
-        Within a row the voltage hardly changes, so a straight line describes the stage.
-        """
+        """Stretches whose rows are averaged, joined over gaps shorter than a row."""
         return true_runs(closed(self.use, min(FEW, self.row - 1)))
 
     @functools.cached_property
@@ -112,15 +102,9 @@ class Excerpt:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Run(Excerpt):
     """
-    Normalised piece; the samples that count were measured, away from a bridged gap.
+    Normalised piece of a record; the samples that count were measured, away from a bridged gap.
 
-    Attributes
-    ----------
-    record : str
-        Name of the record of the piece.
-    piece : Piece
-    known : ndarray of bool, shape (n,)
-        Samples that count, after the memory of the start was forgotten, if it was unknown.
+    `known` marks those behind the place where an unknown memory at the start was forgotten.
     """
 
     record: str
@@ -144,12 +128,7 @@ class Run(Excerpt):
         return chosen
 
     def unbroken(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """
-        Find the stretches between two samples that hold no long gap.
-
-        A regression may run through one or two bridged samples, but a straight line of many
-        samples would bias it.
-        """
+        """Find the stretches between two samples without a gap so long that it biases a fit."""
         whole = np.ones(stop - start, dtype=bool)
         for a, b in true_runs(~self.use[start:stop]):
             if b - a > max(FEW, 0.0125 * self.piece.sample_rate):
@@ -157,12 +136,7 @@ class Run(Excerpt):
         return [(start + a, start + b) for a, b in true_runs(whole)]
 
     def held_out(self) -> Mask:
-        """
-        Mark the samples of triangle, noise and steps that no fit uses.
-
-        In a triangle these are every fifth block without a turning point, in noise and steps the
-        end of the segment.
-        """
+        """Mark every fifth block of a triangle without a turning point, and the end of noise."""
         held = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
             if s.kind in ('noise', 'step'):
@@ -204,12 +178,7 @@ class Prepared:
 
 
 def prepare(records: Sequence[Record]) -> Prepared:
-    """
-    Prepare records for the identification.
-
-    Raises IdentificationError if the displacement does not answer the voltage, and DataError if a
-    record has no displacement.
-    """
+    """Prepare records, and refuse those whose displacement does not answer the voltage."""
     if not records:
         raise IdentificationError('no record was given')
     for record in records:
@@ -240,11 +209,7 @@ def prepare(records: Sequence[Record]) -> Prepared:
 
 
 def filled_in(run: Run, simulated: Array, scaling: Scaling) -> Run:
-    """
-    Replace lost readings of a run by a simulated displacement [m].
-
-    The error of the simulation around a gap is added within it, along a straight line.
-    """
+    """Replace lost readings by a simulated displacement [m], plus a line between its errors."""
     y = simulated + interpolated(run.piece.y - simulated, ~run.use)
     return replace(run, x=scaling.x(y), piece=replace(run.piece, y=y))
 
@@ -267,11 +232,7 @@ def same_rate(one: float, other: float) -> bool:
 
 
 def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
-    """
-    Choose the sampling rate that carries the most voltage travel, and list the data left out.
-
-    Raises IdentificationError if the voltage never moves.
-    """
+    """Choose the sampling rate that carries the most voltage travel, and list what is left out."""
     travel: dict[float, float] = {}
     time: dict[float, float] = {}
     for record in records:
@@ -295,11 +256,7 @@ def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
 
 
 def scaling_of(pieces: Sequence[Piece]) -> Scaling:
-    """
-    Normalise: voltage range and stroke become 1, and Y takes the sign of the gain.
-
-    Raises IdentificationError if the voltage or the displacement never moves.
-    """
+    """Normalise: voltage range and stroke become 1, and Y takes the sign of the gain."""
     low = min(float(p.v.min()) for p in pieces)
     high = max(float(p.v.max()) for p in pieces)
     if high <= low:

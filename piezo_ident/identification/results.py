@@ -1,21 +1,21 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Settings and results of an identification."""
+"""Results of an identification."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from piezo_ident.common.arrays import Mask
-from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.showable import Showable
 from piezo_ident.fitting.free_run import Fit
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult
 from piezo_ident.identification.step2_dynamics import DynamicsResult
-from piezo_ident.identification.step3_hysteresis import HysteresisFit, Solver
+from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
@@ -26,89 +26,6 @@ from piezo_ident.selection.judged import Promise
 
 #: memory at the start of a run, by `piezo_ident.identification.errors.key_of`
 Memories = Mapping[tuple[str, float], StartLike]
-#: callback with the name of the step and its share done; it raises `Cancelled` to stop
-Progress = Callable[[str, float], None]
-
-
-def silent(step: str, share: float) -> None:
-    """Report no progress."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """
-    Settings of an identification.
-
-    Attributes
-    ----------
-    thresholds : int, optional
-        Number of plays of H, including the play at r = 0, evenly spaced over the excited range.
-        The paper takes ten.  By default, number and places are chosen by held-out error.
-    solver : {'least_squares', 'swarm'}
-        Solver of the weights.  Least squares finds the optimum of this convex problem.  The swarm
-        is the solver of the paper, and the model keeps its weights unless `polish` is set.
-    polish : bool
-        Let bounded least squares finish the fit of the swarm.
-    max_order : int
-        Largest na and nb of the search.
-    order : tuple of int, optional
-        Orders (na, nb); no search takes place.
-    delay : int, optional
-        Delay [samples]; no delay is fitted.
-    swarm_size, swarm_iterations : int
-        Number of particles, and most iterations.
-    hold_out : float, optional
-        Seconds at the end of an unlabelled record that are not fitted.  By default a fifth of the
-        record in four stretches is not fitted.
-    seed : int
-        Seed of everything random.
-
-    Raises
-    ------
-    ConfigError
-        If a value is out of range.
-
-    Examples
-    --------
-    Settings of the paper:
-
-    >>> paper = Settings(thresholds=10, solver='swarm')
-    """
-
-    thresholds: int | None = None
-    solver: Solver = 'least_squares'
-    polish: bool = False
-    max_order: int = 15
-    order: tuple[int, int] | None = None
-    delay: int | None = None
-    swarm_size: int = 40
-    swarm_iterations: int = 20_000
-    hold_out: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        sizes = list(self.order or (1, 1))
-        rules = {
-            'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
-            'solver': (self.solver in ('least_squares', 'swarm'), 'least_squares or swarm'),
-            'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
-            'max_order': (1 <= self.max_order <= 50, '1 to 50'),
-            'order': (
-                len(sizes) == 2 and all(1 <= n <= 50 for n in sizes),
-                'two numbers of 1 to 50',
-            ),
-            'delay': (self.delay is None or 0 <= self.delay <= 10_000, '0 to 10000 samples'),
-            'swarm_size': (self.swarm_size >= 2, 'at least 2'),
-            'swarm_iterations': (self.swarm_iterations >= 1, 'positive'),
-            'hold_out': (
-                self.hold_out is None or 0.0 < self.hold_out < float('inf'),
-                'a positive time [s]',
-            ),
-            'seed': (self.seed >= 0, 'zero or positive'),
-        }
-        for name, (is_valid, wanted) in rules.items():
-            if not is_valid:
-                raise ConfigError(f'{name} must be {wanted}, got {getattr(self, name)!r}')
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,27 +131,17 @@ class Identification(Showable):
 
     Attributes
     ----------
-    model : StageModel
-    delay : DelayResult
-    dynamics : DynamicsResult
-    hysteresis : HysteresisFit
-    errors : tuple of ErrorRow
     noise_floor : float or None
         Rms of the sensor noise, % of stroke.
-    noise_source : str
     stroke : float
         Stroke of the records [m].
-    warnings : tuple of str
-        Warnings for the reader.
     not_identified : tuple of (str, str)
         Quantities that the data could not tell, with reasons.
-    settings : Settings
     records : tuple of Record
         Fitted records, then the records for validation.
     memories : mapping of (str, float) to ndarray or Start
         Fitted play outputs at the start of a piece, and creep that goes on from there; keys are
         record name and start time.
-    promise : Promise or None
 
     Examples
     --------

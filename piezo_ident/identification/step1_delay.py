@@ -17,11 +17,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, interpolated
-from piezo_ident.identification.step2_dynamics import (
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.identification.prepare import Run
+from piezo_ident.identification.settings import Progress, Settings
+from piezo_ident.identification.solvers.arx import (
     arx_factor,
+    factor_of,
     free_run_error,
     instrumental_variables,
 )
+from piezo_ident.identification.spectra import band_of, longest_noise, noise_segment
 from piezo_ident.record.record import Piece
 
 #: the average response counts as risen at this many standard deviations of its noise
@@ -279,3 +284,58 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
         return replace(result, samples=samples, std=0.5, source='scan')
     std = max(hold[-1], 1) / np.sqrt(12.0)
     return replace(result, samples=samples, std=std, source='free run')
+
+
+def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
+    """
+    Find the delay from the steps, or without steps from a scan of the ARX loss over the noise.
+
+    A free run over the noise decides if steps and scan differ, or if the scan fails.  Raises
+    IdentificationError if no method tells the delay.
+    """
+    progress('delay', 0.0)
+    if settings.delay is not None:
+        return DelayResult(settings.delay, float('inf'), 'given')
+    pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
+    step = delay_from_steps(pieces) if pieces else None
+    # steps have power at all frequencies; noise up to f leaves an uncertainty of half a period of
+    # f
+    loss = _scan(runs, 'step') if pieces else None
+    if loss is None:
+        loss = _scan(runs, 'noise')
+    scan = None if loss is None else delay_from_loss(loss)
+    progress('delay', 1.0)
+    has_noise = any(run.piece.find('noise') for run in runs)
+    if step is not None and step.samples is not None:
+        result = DelayResult(step.samples, step.std, 'steps', step, loss, scan)
+        return _checked_delay(result, runs) if has_noise and not result.agree else result
+    if scan is None:
+        result = DelayResult(MAX_DELAY, float('inf'), 'none', step, loss)
+        if loss is not None and has_noise:
+            result = _checked_delay(result, runs)
+        if result.source != 'none':
+            return result
+        what = 'too short to scan' if loss is None else f'that hides it below {MAX_DELAY} samples'
+        raise IdentificationError(
+            f'delay: {no_step(step)}, and a drive {what}; add larger steps, or set --delay'
+        )
+    run, start, stop = longest_noise(runs)
+    std = 0.5 * run.piece.sample_rate / band_of(run, start, stop)
+    return DelayResult(scan, std, 'scan', step, loss, scan)
+
+
+def _checked_delay(result: DelayResult, runs: Sequence[Run]) -> DelayResult:
+    run, start, stop = longest_noise(runs)
+    noise = noise_segment(run, run.u, start, stop)
+    return checked_delay(result, noise.fitted, noise.held)
+
+
+def _scan(runs: Sequence[Run], kind: str) -> Array | None:
+    """Compute the one-step loss for each delay, from all segments of a kind."""
+    lags, parts = SCAN_ORDER + MAX_DELAY, []
+    for run in runs:
+        for s in run.piece.find(kind):
+            if s.n >= 4 * (SCAN_ORDER + lags + 1):
+                u, y = run.u[s.start : s.stop], run.x[s.start : s.stop]
+                parts.append((u - u[0], y - y[:20].mean()))
+    return factor_of(parts, SCAN_ORDER, lags).losses(SCAN_ORDER, MAX_DELAY) if parts else None

@@ -2,142 +2,75 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 2: fit ARX dynamics of every order from one factorisation, and refine by instruments.
+Step 2: find G from noise, for every order, free of hysteresis.
 
-    y(k) = - sum_{i=1..na} a_i y(k-i) + sum_{j=1..nb} b_j u(k-d-j+1) + e(k)             (eqs. 4-5)
-
-The data matrix of the largest order is reduced once to its triangular factor R of a few dozen
-rows.  A smaller order or another delay is a choice of columns of R:
-
-        [ y(k-1) .. y(k-na_max) | u(k) .. u(k-d_max-nb_max+1) | y(k) ]   =   Q R
+Under small noise H is not a constant slope: the noise drags its plays along, and a linear fit
+takes this for slow dynamics.  G is therefore found twice.  After a first G, a temporary H with
+fine thresholds is fitted to the triangle.  Its output w = H[v] replaces the voltage of the noise
+segment, and G is found again from w to y.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+import functools
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.solvers.least_squares import ROWS, triangular_factor
-from piezo_ident.identification.solvers.output_error import lag_products
-from piezo_ident.identification.spectra import FrequencyResponse
-from piezo_ident.operators.dynamics import Dynamics, filter_arx
-from scipy.linalg import solve_triangular
-
-#: a column counts as independent if it keeps more than this share of its length once the columns
-#: before it are projected out
-INDEPENDENT = 1e-10
-#: largest radius of a pole that was mirrored into the unit circle
-RADIUS = 0.9995
-#: number of refinements by instrumental variables
-REFINEMENTS = 3
+from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.settings import Progress, Settings
+from piezo_ident.identification.solvers.arx import (
+    arx_factor,
+    ArxFactor,
+    delayed,
+    free_run_error,
+    instrumental_variables,
+    stabilised,
+)
+from piezo_ident.identification.solvers.output_error import (
+    output_error,
+    simulation_error,
+)
+from piezo_ident.identification.spectra import (
+    frequency_response,
+    FrequencyResponse,
+    longest_noise,
+    noise_segment,
+    NoiseSegment,
+)
+from piezo_ident.identification.step3_hysteresis import factorise, fine_thresholds, fit_hysteresis
+from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
+from piezo_ident.operators.hysteresis import Hysteresis
+from scipy import signal
 
 #: real poles below this frequency come from creep or from errors of H, not from dynamics [Hz]
-SLOWEST = 40.0
+SLOW_POLE = 40.0
 #: same limit at low sampling rates, as a share of the rate
-SLOWEST_SHARE = 0.01
+SLOW_POLE_SHARE = 0.01
 #: a pole and a zero whose frequencies differ by less than the factor `PAIR` may come from errors
 #: of H on small motion, if they lie below the share `BELOW_MODES` of the lowest mode that rings; a
 #: mode rings if its damping is below `RINGS`
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
-
-
-@dataclass(frozen=True, eq=False)
-class ArxFactor:
-    """
-    Triangular factor R of the ARX data matrix, which has n rows and the columns drawn above.
-
-    `na_max` is the number of lags of the output.
-    """
-
-    R: Array
-    n: int
-    na_max: int
-
-    def _columns(self, na: int, nb: int, d: int) -> tuple[Array, Array]:
-        # columns of the order, and their lengths
-        A = self.R[:, [*range(na), *range(self.na_max + d, self.na_max + d + nb)]]
-        scale = np.linalg.norm(A, axis=0)
-        scale[scale == 0.0] = 1.0
-        return A, scale
-
-    def fit(self, na: int, nb: int, d: int) -> tuple[Array, float]:
-        """Solve one order for a_1 .. a_na, b_1 .. b_nb, with the mean square one-step error."""
-        (A, scale), y = self._columns(na, nb, d), self.R[:, -1]
-        x = np.linalg.lstsq(A / scale, y, rcond=1e-13)[0] / scale
-        loss = float(np.sum((y - A @ x) ** 2)) / self.n
-        theta = x.copy()
-        theta[:na] *= -1.0
-        return theta, loss
-
-    def losses(self, order: int, delays: int) -> Array:
-        """Compute the one-step loss of na = nb = `order` for the first `delays` delays."""
-        return np.array([self.fit(order, order, d)[1] for d in range(delays)])
-
-    def dynamics(self, na: int, nb: int, d: int) -> Dynamics:
-        """Fit one order by least squares; the dynamics may be unstable."""
-        theta, _ = self.fit(na, nb, d)
-        return Dynamics(a=theta[:na], b=theta[na:])
-
-    def fits(self, na: int, nb_max: int, d: int) -> list[tuple[Array, float]]:
-        """
-        Solve the orders (na, 1) .. (na, nb_max) from one more factorisation.
-
-        Each result equals the result of `fit`, which is called instead if the data cannot tell
-        the columns apart.
-        """
-        A, scale = self._columns(na, nb_max, d)
-        both = np.column_stack([A / scale, self.R[:, -1]])
-        R = np.asarray(np.linalg.qr(both, mode='r'))
-        left = np.square(R[:, -1])
-        size = np.abs(np.diag(R))
-        fits = []
-        for p in range(na + 1, na + nb_max + 1):
-            if size[:p].min() < INDEPENDENT:
-                fits.append(self.fit(na, p - na, d))
-                continue
-            theta = solve_triangular(R[:p, :p], R[:p, -1], check_finite=False) / scale[:p]
-            theta[:na] *= -1.0
-            fits.append((theta, float(np.sum(left[p:])) / self.n))
-        return fits
-
-
-def arx_factor(u: Array, y: Array, na_max: int, n_lags: int) -> ArxFactor:
-    """
-    Reduce input and output to the triangular factor of their lags.
-
-    u and y, shape (n,), have no mean.  The lags are 1 .. na_max of y and 0 .. n_lags - 1 of u.
-    Raises IdentificationError if the samples are fewer than twice the columns.
-    """
-    first = max(na_max, n_lags - 1)
-    n = y.size - first
-    p = na_max + n_lags + 1
-    if n < 2 * p:
-        raise IdentificationError(
-            f'{y.size} samples are too few for {na_max} + {n_lags} lags; measure longer'
-        )
-    windows_y = np.lib.stride_tricks.sliding_window_view(y, na_max + 1)
-    windows_u = np.lib.stride_tricks.sliding_window_view(u, n_lags)
-
-    def rows() -> Iterator[Array]:
-        for start in range(first, y.size, ROWS):
-            stop = min(start + ROWS, y.size)
-            past_y = windows_y[start - na_max : stop - na_max, ::-1]
-            past_u = windows_u[start - n_lags + 1 : stop - n_lags + 1, ::-1]
-            yield np.hstack([past_y[:, 1:], past_u, past_y[:, :1]])
-
-    R = triangular_factor(rows(), p)
-    return ArxFactor(R, n, na_max)
-
-
-def factor_of(parts: Sequence[tuple[Array, Array]], na_max: int, n_lags: int) -> ArxFactor:
-    """Reduce several stretches of input and output, each long enough, to one triangular factor."""
-    factors = [arx_factor(u, y, na_max, n_lags) for u, y in parts]
-    R = triangular_factor([factor.R for factor in factors], na_max + n_lags + 1)
-    return ArxFactor(R, sum(factor.n for factor in factors), na_max)
+#: orders within this share of the best held-out error count as equal; the smallest is tried first
+SLACK = 0.05
+#: share by which instrumental variables must err less than least squares to choose the orders
+BENT = 0.2
+#: share by which a larger order must lower the held-out error
+GAIN = 0.005
+#: samples that are simulated ahead of the first sample that counts
+WARM_UP = 2000
+#: number of candidate orders that are refined and judged again
+CANDIDATES = 5
+#: most iterations that refine a candidate: with a coarse converter at a high rate, least squares
+#: and instrumental variables start far from modes that ring for long
+REFINING = 40
+#: motion slower than this is creep, not dynamics; it is filtered out before G is refined [Hz]
+SLOWEST = 5.0
+#: share by which the error must fall if G is refined with another law of H
+REFINED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,23 +108,6 @@ class OrderTable:
                 step = int(excess / slack) if slack > 0.0 else excess
                 order.append((step, i + j + 2, error, (i + 1, j + 1)))
         return [orders for *_, orders in sorted(order)]
-
-
-def delayed(u: Array, d: int) -> Array:
-    """Delay a signal by whole samples, with zeros first; shape (n,)."""
-    return np.concatenate([np.zeros(d), u[: u.size - d]])
-
-
-def free_run_error(model: Dynamics, d: int, u: Array, y: Array, first: int | None = None) -> float:
-    """
-    Compute the rms free-run error around its mean; infinite for an unstable model.
-
-    Samples before `first` (a fifth of them by default) are left to the transient.
-    """
-    if not model.is_stable:
-        return float('inf')
-    e = y - filter_arx(model.a, model.b, delayed(u, d), at_rest=False)
-    return float(e[y.size // 5 if first is None else first :].std())
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,67 +183,9 @@ def scan_orders(
     )
 
 
-def stabilised(dynamics: Dynamics) -> Dynamics:
-    """Mirror poles outside the unit circle into it, and keep the static gain."""
-    poles = dynamics.poles
-    if poles.size == 0 or np.abs(poles).max() < 1.0:
-        return dynamics
-    outside = np.abs(poles) >= 1.0
-    poles[outside] = 1.0 / np.conj(poles[outside])
-    size = np.abs(poles)
-    poles = np.where(size > RADIUS, poles * RADIUS / np.maximum(size, RADIUS), poles)
-    a = np.real(np.poly(poles))[1:]
-    gain = dynamics.gain
-    b = dynamics.b
-    if np.isfinite(gain) and b.sum() != 0.0:
-        b = b * (gain * (1.0 + a.sum()) / b.sum())
-    return Dynamics(a=a, b=b)
-
-
-_Lags = tuple[Array, int, float, int]
-
-
-def _inner(one: _Lags, other: _Lags, n: int) -> Array:
-    """Sum the products of two groups of lags, each given as (signal, first row, sign, lags)."""
-    (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
-    return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
-
-
-def instrumental_variables(u: Array, y: Array, start: Dynamics, d: int) -> Dynamics:
-    """
-    Refine an ARX model by instrumental variables.
-
-    The instruments are the lags of the input and of the simulated output.  Data and instruments
-    are filtered by 1/A of the previous model.  This removes the bias that output noise gives to
-    least squares.  After Ljung, System Identification, 2nd ed. (1999), section 7.6.
-
-    u and y, shape (n,), have no mean; d is the delay [samples].  The start is made stable first.
-    The result may be unstable: the caller judges.
-    """
-    na, nb = start.a.size, start.b.size
-    model, u, one = stabilised(start), delayed(u, d), np.ones(1)
-    at = max(na, nb)
-    n = u.size - at
-    for _ in range(REFINEMENTS):
-        simulated = filter_arx(model.a, model.b, u, at_rest=False)
-        yf, uf, sf = (filter_arx(model.a, one, x, at_rest=False) for x in (y, u, simulated))
-        u_lags = (uf, at, 1.0, nb)
-        z, phi = ((sf, at - 1, -1.0, na), u_lags), ((yf, at - 1, -1.0, na), u_lags)
-        A = np.block([[_inner(x, other, n) for other in phi] for x in z])
-        right = np.concatenate([_inner(x, (yf, at, 1.0, 1), n) for x in z])[:, 0]
-        size = np.sqrt(np.concatenate([np.diag(_inner(x, x, n)) for x in z]))
-        size[size == 0.0] = 1.0
-        theta = np.linalg.lstsq(A / size[:, None], right / size, rcond=None)[0].astype(float)
-        candidate = Dynamics(a=theta[:na], b=theta[na:])
-        if not candidate.is_stable:
-            return candidate
-        model = candidate
-    return model
-
-
 def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
     """Remove the slow real poles of G, with G(1) = 1; None if a slow pole cannot be removed."""
-    slowest = min(SLOWEST, SLOWEST_SHARE * rate)
+    slowest = min(SLOW_POLE, SLOW_POLE_SHARE * rate)
     poles = G.poles
     size = -np.log(np.maximum(np.abs(poles), 1e-300)) * rate / (2.0 * np.pi)
     slow = np.hypot(size, np.angle(poles) * rate / (2.0 * np.pi)) < slowest
@@ -382,3 +240,210 @@ def _decaying(roots: NDArray[np.complex128], low: float, high: float, rate: floa
     size = _size(roots, rate)
     decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)
     return np.asarray((size > low) & (size < high) & (decay > RINGS * size))
+
+
+def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
+    """Cut out the triangles for fitting H, without (or only) their held-out blocks."""
+    excerpts = []
+    for run in runs:
+        out = run.held_out()
+        triangle = run.mask('triangle') & run.known
+        # the same runs either way, so that each run keeps its offset
+        if np.any(triangle & ~out):
+            excerpts.append(run.excerpt(triangle & (out if held else ~out)))
+    return excerpts
+
+
+def _orders(
+    noise: NoiseSegment,
+    settings: Settings,
+    delay: int,
+    candidates: int,
+    progress: Callable[[float], None],
+) -> list[tuple[DynamicsResult, Dynamics]]:
+    """Search the orders and refine the best few."""
+    size = max(settings.max_order, *(settings.order or (1, 1)))
+    u, y = noise.fitted
+    factor = arx_factor(u, y, size, size + delay)
+    table = scan_orders(
+        factor, delay, settings.max_order, *noise.held, lambda share: progress(0.5 * share)
+    )
+    refined_on = Excerpt(delayed(u, delay), y, np.arange(u.size) >= u.size // 50)
+
+    def held_error(model: Dynamics) -> float:
+        return float(100.0 * free_run_error(model, delay, *noise.held) / noise.held[1].std())
+
+    orders = [settings.order] if settings.order else table.ranked(SLACK)
+    if not settings.order:
+        # noise biases least squares strongly for a mode that rings for thousands of samples
+        sizes = range(2, min(table.loss.shape) + 1, 2)
+        by_instruments = {
+            (n, n): free_run_error(
+                instrumental_variables(u, y, factor.dynamics(n, n, delay), delay),
+                delay,
+                *noise.held,
+            )
+            for n in sizes
+        }
+        least = min(by_instruments.values(), default=np.inf)
+        if least < (1.0 - BENT) * table.held_out.min():
+            orders = [o for o, error in by_instruments.items() if error <= (1.0 + SLACK) * least]
+    orders = orders[:candidates]
+    if not orders:
+        raise IdentificationError(
+            'dynamics: no order up to '
+            f'({settings.max_order}, {settings.max_order}) gave a stable model; '
+            'is the noise segment really noise, and is the displacement its answer?'
+        )
+    refined = []
+    for i, (na, nb) in enumerate(orders):
+        ls = factor.dynamics(na, nb, delay)
+        iv = instrumental_variables(u, y, ls, delay)
+        errors = {'least squares': held_error(ls), 'instrumental variables': held_error(iv)}
+        start = iv if errors['instrumental variables'] < errors['least squares'] else ls
+        # ticks repeat the share of the work, only so that the caller can stop within an iteration
+        tick = functools.partial(progress, 0.5 + 0.5 * i / len(orders))
+        fit = output_error([refined_on], stabilised(start), maxiter=REFINING, tick=tick)
+        errors['output error'] = held_error(fit.dynamics)
+        if np.isfinite(errors['output error']):
+            result = DynamicsResult((na, nb), table, errors, fit.covariance, band=noise.band)
+            refined.append((result, fit.dynamics))
+        progress(0.5 + 0.5 * (i + 1) / len(orders))
+    if not refined:
+        raise IdentificationError('dynamics: no stable model was found; set --order')
+    return refined
+
+
+def second_step(
+    runs: Sequence[Run], delay: Delay, settings: Settings, progress: Progress, lean: bool = False
+) -> tuple[DynamicsResult, Dynamics]:
+    """
+    Find G without hysteresis; the returned dynamics are stable, with G(1) = 1.
+
+    `lean` takes the pairs of `without_pairs` out of G.  Raises IdentificationError if no
+    order gives a stable model.
+    """
+    d = delay.samples
+    run, start, stop = longest_noise(runs)
+
+    def part(start: float, width: float) -> Callable[[float], None]:
+        return lambda share: progress('dynamics', start + width * share)
+
+    progress('dynamics', 0.0)
+    # a first G that is only good enough to undo the hysteresis
+    rate = run.piece.sample_rate
+    raw = noise_segment(run, run.u, start, stop)
+    [(_, first)] = _orders(raw, settings, d, 1, part(0.0, 0.3))
+    del raw  # a gigabyte for a record of an hour
+    G = fast_part(first, rate, lean)
+
+    excerpts = triangle_excerpts(runs)
+    swing = max(e.swing for e in excerpts)
+    excursion = float(np.ptp(run.u[start:stop]))
+    r = fine_thresholds(swing, excursion)
+
+    def undo(G: Dynamics) -> Hysteresis:
+        return fit_hysteresis(factorise(excerpts, r, G, delay), r).hysteresis
+
+    H = undo(G)
+    progress('dynamics', 0.45)
+    undone = noise_segment(run, run.through(H), start, stop)
+    candidates = _orders(undone, settings, d, CANDIDATES, part(0.45, 0.2))
+    result, G = _best_in_free_run(candidates, runs, H, delay, progress, lean)
+    H = undo(G)
+    tick = functools.partial(progress, 'dynamics', 0.85)
+    fit = output_error(_stretches(runs, H, delay)[0], G, maxiter=8, tick=tick)
+    G = fast_part(fit.dynamics, rate, lean)
+    progress('dynamics', 0.95)
+    # regress the measured and the modelled displacement alike: the noise drags plays along in both
+    noise = slice(max(0, start - WARM_UP), stop)
+    g_u, g_w = (
+        filter_arx(G.a, G.b, delay.apply(z)[noise])[start - stop :]
+        for z in (run.u, run.through(H))
+    )
+    g_u, g_w, x = (signal.detrend(z) for z in (g_u, g_w, run.x[start:stop]))
+    slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
+    response = frequency_response(run.u[start:stop], run.x[start:stop], rate, result.band)
+    progress('dynamics', 1.0)
+    found_last = replace(
+        result,
+        covariance=fit.normalised_covariance,
+        response=response,
+        bias=float(run.u[start:stop].mean()),
+        slope_measured=slope_measured,
+        slope_model=slope_model,
+    )
+    return found_last, G
+
+
+def _best_in_free_run(
+    candidates: Sequence[tuple[DynamicsResult, Dynamics]],
+    runs: Sequence[Run],
+    H: Hysteresis,
+    delay: Delay,
+    progress: Progress,
+    lean: bool,
+) -> tuple[DynamicsResult, Dynamics]:
+    """Refine each G by its free run, and choose the best on the held-out samples."""
+    # noise alone hardly shows a slow pole with a tiny residue; steps that were not fitted show it
+    stretches, held = _stretches(runs, H, delay)
+    rate = runs[0].piece.sample_rate
+    best, (result, G) = float('inf'), candidates[0]
+    G = fast_part(G, rate, lean)
+    for i, (candidate, start) in enumerate(candidates):
+        tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(candidates))
+        fast = fast_part(start, rate, lean)
+        fit = output_error(stretches, fast, maxiter=6, tick=tick)
+        score = simulation_error(held, fit.dynamics)
+        # a larger model comes later, and must lower the error to win
+        if score < best / (1.0 + GAIN):
+            best, result = score, candidate
+            G = fast_part(fit.dynamics, rate, lean)
+        progress('dynamics', 0.65 + 0.2 * (i + 1) / len(candidates))
+    return result, G
+
+
+def beside_law(
+    runs: Sequence[Run],
+    H: Hysteresis,
+    dynamics: DynamicsResult,
+    G: Dynamics,
+    delay: Delay,
+    lean: bool = False,
+) -> tuple[DynamicsResult, Dynamics] | None:
+    """
+    Refine G with an H of another law than the law with which G was found.
+
+    None if the refined G does not lower the held-out error by `REFINED`.
+    """
+    stretches, held = _stretches(runs, H, delay)
+    fit = output_error(stretches, G, maxiter=8)
+    refined = fast_part(fit.dynamics, runs[0].piece.sample_rate, lean)
+    if simulation_error(held, refined) > (1.0 - REFINED) * simulation_error(held, G):
+        return None
+    return replace(dynamics, covariance=fit.normalised_covariance), refined
+
+
+def _stretches(
+    runs: Sequence[Run], H: Hysteresis, delay: Delay
+) -> tuple[list[Excerpt], list[Excerpt]]:
+    """Cut out the excerpts that refine G, and the same excerpts with the held-out samples only."""
+    fitted: list[Excerpt] = []
+    held: list[Excerpt] = []
+    for run in runs:
+        out = run.held_out()
+        use = run.mask('step', 'settle', 'noise') & run.use
+        if use.any():
+            # samples before the first used sample only have to let the transient die away
+            first, last = np.flatnonzero(use)[[0, -1]]
+            part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
+            w, y = delay.apply(run.through(H))[part], run.x[part]
+            w, y = w - w[0], y - y[:20].mean()
+            if run.piece.sample_rate > 2.0 * SLOWEST:
+                # input and output pass the same filter, so G still leads from one to the other
+                sos = signal.butter(2, SLOWEST, 'high', fs=run.piece.sample_rate, output='sos')
+                w, y = signal.sosfilt(sos, w), signal.sosfilt(sos, y)
+            for stretches, mask in ((fitted, use & ~out), (held, use & out)):
+                if mask.any():
+                    stretches.append(Excerpt(w, y, mask[part]))
+    return fitted, held

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.identification.prepare import Excerpt
-from piezo_ident.identification.results import Progress, Settings
+from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
@@ -155,11 +155,7 @@ def with_small(
 
 @dataclass(frozen=True, eq=False)
 class Means(Excerpt):
-    """
-    Excerpt of fast motion, compared by means over rows.
-
-    A mean suppresses the error of G, which H cannot fit.
-    """
+    """Excerpt of fast motion, compared by means over rows, in which the error of G vanishes."""
 
     @property
     def row(self) -> int:
@@ -170,15 +166,10 @@ class Means(Excerpt):
 @dataclass(frozen=True, eq=False)
 class Choice:
     """
-    Choice of a law for H.
+    Choice of a law for H; None if the plain sum of plays stays.
 
-    Attributes
-    ----------
-    law : HysteresisLaw or None
-        None if the plain sum of plays stays.
-    errors : mapping of str to float
-        Error of each law that was tried, on parts predicted from all others: geometric mean of
-        their rms, normalised.
+    `errors` holds for each law that was tried the geometric mean of the rms errors on parts
+    predicted from all others, normalised.
     """
 
     law: HysteresisLaw | None

@@ -18,13 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.identification.prepare import Excerpt
+from piezo_ident.identification.settings import Solver
 from piezo_ident.identification.solvers.least_squares import (
     bounded_least_squares,
     triangular_factor,
@@ -35,8 +36,6 @@ from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.operators.kernels import hysteresis
 from scipy.optimize import OptimizeResult
-
-Solver = Literal['least_squares', 'swarm']
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)

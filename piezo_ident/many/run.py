@@ -23,7 +23,8 @@ from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.common.files import unwritable, write_text
 from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
-from piezo_ident.identification.results import Identification, Settings
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.settings import Settings
 from piezo_ident.many.table import diagnosed, identified, natural, Row, Value
 from piezo_ident.many.workers import dask, processes
 from piezo_ident.model.files import load

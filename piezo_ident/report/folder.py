@@ -16,7 +16,8 @@ from typing import Any, TYPE_CHECKING
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.files import write_together
 from piezo_ident.diagnosis.results import Diagnosis
-from piezo_ident.identification.results import Identification, Progress, silent
+from piezo_ident.identification.results import Identification
+from piezo_ident.identification.settings import Progress, silent
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.multi_axis import EachAxis

@@ -15,13 +15,8 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.identification.identify import identify_and_judge
-from piezo_ident.identification.results import (
-    Identification,
-    Progress,
-    Settings,
-    silent,
-    Steps,
-)
+from piezo_ident.identification.results import Identification, Steps
+from piezo_ident.identification.settings import Progress, Settings, silent
 from piezo_ident.model.multi_axis import (
     axes_of,
     axis_record,

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program
-from piezo_ident.identification import identify as identify_module
-from piezo_ident.identification import three_steps
+from piezo_ident.identification import step1_delay, three_steps
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.refusals import refuse_undriven
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import delay_from_steps
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
@@ -116,7 +115,7 @@ def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
     def late(pieces):
         return replace(delay_from_steps(pieces), samples=7)
 
-    monkeypatch.setattr(three_steps, 'delay_from_steps', late)
+    monkeypatch.setattr(step1_delay, 'delay_from_steps', late)
     result = identify(short(noise=2e-5), QUICK)
     assert (result.delay.step.samples, result.delay.scan) == (7, 3)
     assert (result.delay.samples, result.delay.source) == (3, 'scan')
@@ -604,13 +603,13 @@ def test_small_noise_at_a_bias_drives_the_stage():
 
 @pytest.mark.parametrize(('delay', 'used', 'missing'), [(5, 5, []), (None, 0, ['delay'])])
 def test_a_g_that_goes_takes_no_given_delay_along(monkeypatch, delay, used, missing):
-    second = identify_module.second_step
+    second = three_steps.second_step
 
     def wrong(*args):
         # a lag of 0.25 s, as no stage here has
         return second(*args)[0], Dynamics([-0.9998], [2e-4])
 
-    monkeypatch.setattr(identify_module, 'second_step', wrong)
+    monkeypatch.setattr(three_steps, 'second_step', wrong)
     settings = replace(QUICK, delay=delay, order=(2, 2))
     result = identify(short(), settings)
     assert result.model.dynamics.is_static
@@ -632,6 +631,6 @@ def test_a_singular_fit_is_an_error_of_ours(monkeypatch):
     def first_step(*args):
         raise np.linalg.LinAlgError('Singular matrix')
 
-    monkeypatch.setattr('piezo_ident.identification.identify.first_step', first_step)
+    monkeypatch.setattr('piezo_ident.identification.three_steps.first_step', first_step)
     with pytest.raises(IdentificationError, match='tell the parameters apart'):
         identify(short(), QUICK)

@@ -5,7 +5,8 @@
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.identification.results import ErrorRow, Identification, Settings, Steps
+from piezo_ident.identification.results import ErrorRow, Identification, Steps
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult, StepDelay
 import pytest
 

@@ -10,7 +10,7 @@ import numpy as np
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import Excerpt
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.starts import fit_starts
 from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage

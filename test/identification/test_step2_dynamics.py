@@ -7,14 +7,8 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import A, B
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.step2_dynamics import (
-    arx_factor,
-    fast_part,
-    instrumental_variables,
-    scan_orders,
-    stabilised,
-    without_slow_part,
-)
+from piezo_ident.identification.solvers.arx import arx_factor, instrumental_variables, stabilised
+from piezo_ident.identification.step2_dynamics import fast_part, scan_orders, without_slow_part
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 import pytest
 

@@ -11,14 +11,10 @@ from paper_stage import STAGE as PAPER
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.prepare import runs_of, scaling_of
-from piezo_ident.identification.results import Settings, silent
+from piezo_ident.identification.settings import Settings, silent
+from piezo_ident.identification.step1_delay import first_step
+from piezo_ident.identification.step2_dynamics import beside_law, second_step, triangle_excerpts
 from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
-from piezo_ident.identification.three_steps import (
-    beside_law,
-    first_step,
-    second_step,
-    triangle_excerpts,
-)
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
 from programs import identification_program

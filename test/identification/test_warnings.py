@@ -10,7 +10,7 @@ from paper_stage import PAPER
 import piezo_ident as pi
 from piezo_ident.identification.errors import predictions_of
 from piezo_ident.identification.prepare import Excerpt, runs_of, scaling_of
-from piezo_ident.identification.results import Settings
+from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult, StepDelay
 from piezo_ident.identification.warnings import (
     only_jumps,

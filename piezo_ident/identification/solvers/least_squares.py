@@ -47,17 +47,7 @@ def bounded_least_squares(R: Array, lower: Array, upper: Array) -> tuple[Array, 
     """
     Minimise ``|A x - y|^2`` inside bounds, where R is the factor of ``[A y]``.
 
-    Parameters
-    ----------
-    R : ndarray, shape (n + 1, n + 1)
-    lower, upper : ndarray, shape (n,)
-        Bounds, possibly infinite.
-
-    Returns
-    -------
-    x : ndarray, shape (n,)
-    loss : float
-        Sum of squares at x.
+    The bounds, shape (n,), may be infinite.  The result is x and the sum of squares there.
 
     Examples
     --------

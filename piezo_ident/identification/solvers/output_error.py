@@ -77,19 +77,8 @@ def lag_products(x: Array, z: Array, x_at: int, z_at: int, n: int, n_x: int, n_z
 
         S(i+1, j+1) = S(i, j) + x(s-1-i) z(s-1-j) - x(e-1-i) z(e-1-j)
 
-    Parameters
-    ----------
-    x, z : ndarray, shape (any,)
-    x_at, z_at : int
-        Index of the first of the n samples s .. e-1 in each signal.  At least as many samples as
-        lags come before it.
-    n : int
-    n_x, n_z : int
-        Number of lags of each, at least 1.
-
-    Returns
-    -------
-    ndarray, shape (n_x, n_z)
+    `x_at` and `z_at` are the index of the first of the n samples s .. e-1 in each signal, behind
+    at least as many samples as lags.  The sums have shape (n_x, n_z), the numbers of lags.
 
     Examples
     --------
@@ -208,21 +197,10 @@ def output_error(
     tick: Callable[[], None] = lambda: None,
 ) -> OutputErrorFit:
     """
-    Refine dynamics by free-run simulation error.
+    Refine stable dynamics of given orders by free-run simulation error.
 
-    Parameters
-    ----------
-    stretches : sequence of Excerpt
-    start : Dynamics
-        Stable start; its orders are kept.
-    maxiter : int, optional
-    tick : callable, optional
-        Called once an iteration; it may raise to stop the work.
-
-    Returns
-    -------
-    OutputErrorFit
-        Stable dynamics; the start itself if no step lowers the error.
+    The result is stable, and the start itself if no step lowers the error.  `tick` is called once
+    an iteration; it may raise to stop the work.
     """
     na, nb = start.a.size, start.b.size
     problem = _Problem(stretches, na, nb)

@@ -23,7 +23,8 @@ from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import first_steps
-from piezo_ident.identification.results import Identification, Settings, Steps
+from piezo_ident.identification.results import Identification, Steps
+from piezo_ident.identification.settings import Settings
 from piezo_ident.live.capture import (
     records_of_runs,
     refuse_incomplete,

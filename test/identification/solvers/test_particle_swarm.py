@@ -7,13 +7,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import PAPER
 from piezo_ident.excitation.signals import triangle
+from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
-from piezo_ident.identification.step3_hysteresis import (
-    even_thresholds,
-    Excerpt,
-    factorise,
-    fit_hysteresis,
-)
+from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 import pytest
 from scipy.optimize import lsq_linear
 
