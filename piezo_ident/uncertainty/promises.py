@@ -46,8 +46,7 @@ def with_band(model: StageModel, band: PredictionBand) -> StageModel:
 
 def promised_identification(result: Identification, judged: Judged) -> Identification:
     """Add promise and band to an identification."""
-    model = result.model
-    blocks = blocks_of(model, judged.runs)
+    model, blocks = result.model, blocks_of(result.model, judged.runs)
     if blocks is None:
         return result
     band = calibrated(blocks)
