@@ -210,11 +210,12 @@ class Lab:
 
     def call(self, service: str, step: str, state: str = 'done') -> None:
         """Call a service, and show the progress of its node until it is in a state."""
+        node = service.rpartition('/')[0]
         self.ask(service)
-        self.wait_for(service.rpartition('/')[0], step, state)
+        self.wait_for(node, step, lambda: self.client.status(node).get('state') == state)
 
-    def wait_for(self, node: str, step: str, state: str = 'done') -> None:
-        """Show the progress of a node until it has been in a state since it was asked."""
+    def wait_for(self, node: str, step: str, condition: Callable[[], Any]) -> None:
+        """Show the progress of a node until a condition holds."""
 
         def look() -> None:
             status = self.client.status(node)
@@ -225,7 +226,7 @@ class Lab:
                 share = float(status.get('progress', 0)) / 100
                 self.progress.show(STATES.get(now, step), share)
 
-        self.wait(lambda: state in self.client.states(node), step, look)
+        self.wait(condition, step, look)
 
     def call_for_report(self, service: str, step: str) -> dict[str, Any]:
         """Call a service, and return the report that it ends with."""
@@ -408,7 +409,9 @@ def live(out: Path, progress: Steps) -> Session:
         # the identifier draws meanwhile
         lab.ask('identifier/save')
         after = lab.without_loss(lambda: lab.play('the same motions', 'after'))
-        lab.wait_for('identifier', 'reports')
+        # it may have gone on to capture since
+        ended = {'done', *FAILED}
+        lab.wait_for('identifier', 'reports', lambda: ended & {*client.states('identifier')})
         recorded = lab.replay(after, out / 'reports' / 'diagnosis' / 'model.yaml')
         for name, code in nodes.stop().items():
             if code:
