@@ -209,8 +209,8 @@ def last_second(free: Array, late: Array) -> Array:
     return free + mean
 
 
-def ways(model: pi.StageModel, case: Case, late: Array) -> tuple[list[Array], Observed]:
-    """Return what each way says, with displacement a horizon before, and the observer's own."""
+def ways(model: pi.StageModel, case: Case, late: Array) -> tuple[list[Array], list[Observed]]:
+    """Return what each way says, with displacement a horizon before, and all observers."""
     t, v = np.arange(case.v.size) / RATE, case.v
     free = model.stream().process(v, t)
     seen = Observer(model).process(v, free, late)
@@ -219,8 +219,8 @@ def ways(model: pi.StageModel, case: Case, late: Array) -> tuple[list[Array], Ob
     adaptation = Adaptation(model, 'hysteresis')
     learnt = adaptation.process(v, t, free, late)
     adapted = Observer(model).process(v, learnt, late)
-    observed = [x.estimate for x in (seen, gain, drift, adapted)]
-    return [free, last_second(free, late), *observed], adapted
+    observed = [seen, gain, drift, adapted]
+    return [free, last_second(free, late), *(x.estimate for x in observed)], observed
 
 
 def judged(name: str, stage: Stage, model: pi.StageModel, change: str) -> Row:
@@ -229,14 +229,13 @@ def judged(name: str, stage: Stage, model: pi.StageModel, change: str) -> Row:
     noise = NOISE * np.random.default_rng(1).standard_normal(case.y.size)
     late = np.concatenate([np.full(HORIZON, np.nan), case.y + noise])[: case.y.size]
     late[round(CUT * RATE) + HORIZON :] = np.nan
-    said, adapted = ways(model, case, late)
+    said, (observed, *_, adapted) = ways(model, case, late)
 
     def errors(begin: float, end: float) -> tuple[float, ...]:
         part = slice(round(begin * RATE), round(end * RATE))
         rms = [np.sqrt(np.mean((x - case.y)[part] ** 2)) for x in said]
         return tuple(float(100.0 * e / SPAN) for e in rms)
 
-    observed = Observer(model).process(case.v, said[0], late)
     parts = [slice(round(a * RATE), round(b * RATE)) for a, b in ((2.0, AT), (CUT - JUDGED, CUT))]
     claims = [
         float(np.mean(np.abs(x.estimate - case.y)[s] <= NINE_OF_TEN * x.std[s]))
