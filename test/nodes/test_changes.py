@@ -47,9 +47,9 @@ def lab():
 
 
 class Stage:
-    """A stage that has another model and another zero from a sample on."""
+    """A stage that has another model, another zero and a gain that drifts from a sample on."""
 
-    def __init__(self, model=MODEL, zero=0.0, before=()):
+    def __init__(self, model=MODEL, zero=0.0, drift=0.0, before=()):
         sensor = Sensor(noise_rms=2e-9)
         runs = [
             SimulatedStage(m, sensor).run(np.random.default_rng(k))
@@ -59,13 +59,13 @@ class Stage:
             run.process(np.zeros(1))
             if len(before):
                 run.process(before)
-        self._runs, self._zero, self._count = runs, zero, 0
+        self._runs, self._zero, self._drift, self._count = runs, zero, drift, 0
 
     def process(self, v):
         old, new = (run.process(v) for run in self._runs)
-        changed = self._count + np.arange(v.size) >= AT
+        since = self._count + np.arange(v.size) - AT
         self._count += v.size
-        return np.where(changed, new + self._zero, old)
+        return np.where(since >= 0, new * (1.0 + self._drift * since / FS) + self._zero, old)
 
 
 def at_the_top():
@@ -121,3 +121,12 @@ def test_the_sentence_names_what_changed_of_a_running_stage(lab, change):
     said = says(lab, stage, change, wanted)
     others = {'gain', 'dynamics', 'hysteresis'} - {change}
     assert not any(name in said.partition('what changed')[2] for name in others), said
+
+
+def test_a_drift_of_the_gain_is_followed_on_request_and_named(lab):
+    assert lab.set('model', 'observe_drift', True) == (True, '')
+    # three standard deviations of the drift make it named
+    said = says(lab, Stage(drift=1e-2), 'drift', ('corrected: ', 'drift of the gain +'))
+    size = float(said.partition('drift of the gain')[2].split()[0])
+    assert 'identify again' not in said and size == pytest.approx(1.0, abs=0.4)
+    assert lab.set('model', 'observe_drift', False) == (True, '')
