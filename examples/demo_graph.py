@@ -16,7 +16,7 @@ import shutil
 import time
 from typing import Any, Protocol
 
-from demo_page import Array, Motion, MOTIONS, Recorded, Session, STAGE
+from demo_page import Array, Motion, MOTIONS, pictures, Recorded, Session, STAGE
 from lab_graph import Client, Nodes, own_domain
 import numpy as np
 import piezo_ident as pi
@@ -409,6 +409,7 @@ def live(out: Path, progress: Steps) -> Session:
         # the identifier draws meanwhile
         lab.ask('identifier/save')
         after = lab.without_loss(lambda: lab.play('the same motions', 'after'))
+        pictures(before.motion, after.motion)  # kept for the page
         # it may have gone on to capture since
         ended = {'done', *FAILED}
         lab.wait_for('identifier', 'reports', lambda: ended & {*client.states('identifier')})

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+import functools
 import json
 from pathlib import Path
 import shlex
@@ -242,11 +243,22 @@ def _key(fig: Figure, residuals: bool = True) -> None:
     )
 
 
+@functools.cache
+def pictures(before: Motion, after: Motion) -> Mapping[str, bytes]:
+    """Draw the pictures of the page, which may be done before it is written."""
+    return {
+        'loops': style.png(loops_figure(before, after)),
+        'traces': style.png(traces_figure(after)),
+        'residual': style.png(residual_figure(before, after)),
+    }
+
+
 # the page
 
 
 def _motion_parts(session: Session) -> Iterable[Section]:
     before, after = session.before, session.after
+    drawn = pictures(before, after)
     live = session.recorded is not None
     who = 'the model node, live' if live else 'the model'
     yield Section(
@@ -258,13 +270,13 @@ def _motion_parts(session: Session) -> Iterable[Section]:
                 f'Displacement over voltage, measured and predicted by {who}, with the effects '
                 'that the diagnosis added. Below: measured - predicted of the same motions, '
                 'before and after the diagnosis.',
-                style.png(loops_figure(before, after)),
+                drawn['loops'],
             ),
             Shown(
                 'traces',
                 'Over time',
                 'The motions and three periods of the fastest.',
-                style.png(traces_figure(after)),
+                drawn['traces'],
             ),
         ],
     )
@@ -285,7 +297,7 @@ def _motion_parts(session: Session) -> Iterable[Section]:
                 'The residual',
                 'What the model misses, before and after the diagnosis, and what its estimate '
                 'misses. ' + (NOTE if live else 'What remains is the noise of the sensor.'),
-                style.png(residual_figure(before, after)),
+                drawn['residual'],
             ),
         ],
     )
