@@ -34,8 +34,7 @@ from piezo_ident.cli import main as piezo_ident
 from piezo_ident.effects import catalogue
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.prepare import Excerpt
-from piezo_ident.identification.solvers.arx import arx_factor
-from piezo_ident.identification.step2_dynamics import scan_orders
+from piezo_ident.identification.solvers.arx import arx_factor, scan_orders
 from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis

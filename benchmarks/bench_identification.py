@@ -23,10 +23,10 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import prepare, Run
 from piezo_ident.identification.settings import Settings, silent
-from piezo_ident.identification.solvers.arx import arx_factor
+from piezo_ident.identification.solvers.arx import arx_factor, scan_orders
 from piezo_ident.identification.spectra import excited_band, prefilter
 from piezo_ident.identification.step1_delay import first_step
-from piezo_ident.identification.step2_dynamics import scan_orders, second_step, triangle_excerpts
+from piezo_ident.identification.step2_dynamics import second_step, triangle_excerpts
 from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay

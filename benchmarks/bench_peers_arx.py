@@ -25,10 +25,9 @@ import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
 from piezo_ident.identification.prepare import Excerpt
-from piezo_ident.identification.solvers.arx import arx_factor, stabilised
+from piezo_ident.identification.solvers.arx import arx_factor, scan_orders, stabilised
 from piezo_ident.identification.solvers.output_error import output_error
 from piezo_ident.identification.spectra import excited_band, prefilter
-from piezo_ident.identification.step2_dynamics import scan_orders
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Dynamics
 from scipy.signal import lfilter

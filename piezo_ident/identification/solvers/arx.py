@@ -14,7 +14,7 @@ rows.  A smaller order or another delay is a choice of columns of R:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +144,72 @@ def free_run_error(model: Dynamics, d: int, u: Array, y: Array, first: int | Non
         return float('inf')
     e = y - filter_arx(model.a, model.b, delayed(u, d), at_rest=False)
     return float(e[y.size // 5 if first is None else first :].std())
+
+
+@dataclass(frozen=True, eq=False)
+class OrderTable:
+    """
+    Table of all orders; arrays have shape (na_max, nb_max) with entry [na-1, nb-1].
+
+    It holds the one-step loss on the fitted samples, the criteria of Akaike and of Schwarz, and
+    the free-run rms error on the held-out samples, infinite for an unstable model.
+    """
+
+    loss: Array
+    aic: Array
+    bic: Array
+    held_out: Array
+
+    def best(self, criterion: str) -> tuple[int, int]:
+        """Give (na, nb) of the smallest ``aic``, ``bic`` or ``held_out``."""
+        table = getattr(self, criterion)
+        i, j = np.unravel_index(int(np.argmin(table)), table.shape)
+        return int(i) + 1, int(j) + 1
+
+    def ranked(self, slack: float = 0.0) -> list[tuple[int, int]]:
+        """
+        Sort the stable orders by held-out error, then by size.
+
+        Errors within the same step of `slack`, relative to the best, count as equal.
+        """
+        order = []
+        best = float(self.held_out.min())
+        for i, j in np.ndindex(self.held_out.shape):
+            error = float(self.held_out[i, j])
+            if np.isfinite(error):
+                excess = error / best - 1.0 if best > 0.0 else 0.0
+                step = int(excess / slack) if slack > 0.0 else excess
+                order.append((step, i + j + 2, error, (i + 1, j + 1)))
+        return [orders for *_, orders in sorted(order)]
+
+
+def scan_orders(
+    factor: ArxFactor,
+    d: int,
+    nb_max: int,
+    u_held: Array,
+    y_held: Array,
+    tick: Callable[[float], None] = lambda share: None,
+) -> OrderTable:
+    """
+    Fit all orders up to (na_max, nb_max), and judge each by its free run on held-out data.
+
+    The factor holds the fitted data, `u_held` and `y_held` the other data; d is the delay
+    [samples].  `tick` is called with the share of the work done, and may raise to stop it.
+    """
+    shape = (factor.na_max, nb_max)
+    loss, held = np.full(shape, np.inf), np.full(shape, np.inf)
+    size = np.add.outer(np.arange(1, shape[0] + 1), np.arange(1, shape[1] + 1))
+    for na in range(1, shape[0] + 1):
+        for nb, (theta, one_step) in enumerate(factor.fits(na, nb_max, d), 1):
+            loss[na - 1, nb - 1] = one_step
+            model = Dynamics(a=theta[:na], b=theta[na:])
+            held[na - 1, nb - 1] = free_run_error(model, d, u_held, y_held)
+        tick(na / shape[0])
+    log_loss = factor.n * np.log(np.maximum(loss, np.finfo(float).tiny))
+    return OrderTable(
+        loss=loss, aic=log_loss + 2.0 * size, bic=log_loss + np.log(factor.n) * size, held_out=held
+    )
 
 
 def stabilised(dynamics: Dynamics) -> Dynamics:
