@@ -160,24 +160,10 @@ def first_steps(
     progress: Progress,
 ) -> Steps:
     """
-    Take the first step alone, or the second step and the first if it is missing.
+    Take the step `which`, 'delay' or 'dynamics', and the first step before it if it is missing.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        With segments ``step`` or ``noise`` for the delay; with ``noise`` and ``triangle`` for the
-        dynamics, since the hysteresis has to be undone.
-    settings : Settings
-    which : {'delay', 'dynamics'}
-    steps : Steps or None
-        Results of earlier steps.
-    progress : callable
-        As for `identify`.
-
-    Raises
-    ------
-    IdentificationError
-        If the data do not carry this step.
+    The delay needs segments ``step`` or ``noise``.  The dynamics need ``noise`` and ``triangle``,
+    since the hysteresis has to be undone.  Raises IdentificationError without them.
     """
     data, steps = prepare(records), (steps or Steps()).beside(settings.delay)
     with singular_is_ours():

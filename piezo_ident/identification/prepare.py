@@ -29,6 +29,8 @@ BLOCKS, EVERY = 60, 5
 END_HELD = 0.2
 #: a record starts with a known memory if its voltage starts within this share of the lowest
 REST = 0.01
+#: share of its range by which the voltage of a run must move
+MOVES = 0.02
 #: largest change of the voltage within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
 #: most lost readings in a row that `Excerpt.span` bridges, as the voltage may turn there (taste;

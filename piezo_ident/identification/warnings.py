@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.identification.errors import Prediction
-from piezo_ident.identification.hold_out import MOVES
-from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.prepare import Excerpt, MOVES, Run
 from piezo_ident.identification.results import Identification
 from piezo_ident.identification.step1_delay import DelayResult, no_step
 from piezo_ident.identification.step2_dynamics import DynamicsResult
