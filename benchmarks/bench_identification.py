@@ -21,12 +21,12 @@ import numpy as np
 from piezo_ident.common.config import find_config
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
-from piezo_ident.identification.prepare import prepare, Run
+from piezo_ident.identification.prepare import excerpts_of, prepare, Run
 from piezo_ident.identification.settings import Settings, silent
 from piezo_ident.identification.solvers.arx import arx_factor, scan_orders
 from piezo_ident.identification.spectra import excited_band, prefilter
 from piezo_ident.identification.step1_delay import first_step
-from piezo_ident.identification.step2_dynamics import second_step, triangle_excerpts
+from piezo_ident.identification.step2_dynamics import second_step
 from piezo_ident.identification.step3_hysteresis import even_thresholds, factorise, fit_hysteresis
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay
@@ -90,7 +90,7 @@ def by_steps(record: Record, runs: int) -> tuple[str, str]:
     data = prepare([record])
     delay = Delay(first_step(data.runs, settings, silent).samples)
     _, G = second_step(data.runs, delay, settings, silent)
-    excerpts = triangle_excerpts(data.runs)
+    excerpts = excerpts_of(data.runs, 'triangle')
     n = int(sum(e.use.sum() for e in excerpts))
     r = even_thresholds(max(float(np.ptp(e.u[e.use])) for e in excerpts), settings.thresholds)
     R = factorise(excerpts, r, G, delay)

@@ -22,10 +22,9 @@ import logging
 import alone  # noqa: F401 - one thread of BLAS
 import numpy as np
 from piezo_ident.excitation.program import Program
-from piezo_ident.identification.prepare import prepare
+from piezo_ident.identification.prepare import excerpts_of, prepare
 from piezo_ident.identification.solvers.least_squares import bounded_least_squares
 from piezo_ident.identification.solvers.particle_swarm import particle_swarm, Quadratic
-from piezo_ident.identification.step2_dynamics import triangle_excerpts
 from piezo_ident.identification.step3_hysteresis import (
     even_thresholds,
     factorise,
@@ -69,7 +68,7 @@ def problem() -> Problem:
     stage = SimulatedStage.load('paper')
     sequence = Program.load('identification').build(20_000.0)
     record = stage.play(sequence, np.random.default_rng(0))
-    excerpts = triangle_excerpts(prepare([record]).runs)
+    excerpts = excerpts_of(prepare([record]).runs, 'triangle')
     r = even_thresholds(max(float(np.ptp(e.u[e.use])) for e in excerpts), OPERATORS)
     R = factorise(excerpts, r, stage.model.dynamics.normalised(), stage.model.delay)
     inner = R[len(excerpts) :, len(excerpts) :]

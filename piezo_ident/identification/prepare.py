@@ -316,3 +316,14 @@ def runs_of(
                 Run(u=u, x=x, use=part.sound, record=record.name, piece=piece, known=known)
             )
     return runs
+
+
+def excerpts_of(runs: Sequence[Run], *kinds: str, held: bool = False) -> list[Excerpt]:
+    """Cut out the segments of some kinds, without (or only) their held-out samples."""
+    excerpts = []
+    for run in runs:
+        out, use = run.held_out(), run.mask(*kinds) & run.known
+        # the same runs either way, so that each run keeps its offset
+        if np.any(use & ~out):
+            excerpts.append(run.excerpt(use & (out if held else ~out)))
+    return excerpts

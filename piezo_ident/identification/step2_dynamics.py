@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.prepare import Excerpt, excerpts_of, Run
 from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.solvers.arx import (
     arx_factor,
@@ -176,18 +176,6 @@ def _decaying(roots: NDArray[np.complex128], low: float, high: float, rate: floa
     return np.asarray((size > low) & (size < high) & (decay > RINGS * size))
 
 
-def triangle_excerpts(runs: Sequence[Run], held: bool = False) -> list[Excerpt]:
-    """Cut out the triangles for fitting H, without (or only) their held-out blocks."""
-    excerpts = []
-    for run in runs:
-        out = run.held_out()
-        triangle = run.mask('triangle') & run.known
-        # the same runs either way, so that each run keeps its offset
-        if np.any(triangle & ~out):
-            excerpts.append(run.excerpt(triangle & (out if held else ~out)))
-    return excerpts
-
-
 def _orders(
     noise: NoiseSegment,
     settings: Settings,
@@ -271,7 +259,7 @@ def second_step(
     del raw  # a gigabyte for a record of an hour
     G = fast_part(first, rate, lean)
 
-    excerpts = triangle_excerpts(runs)
+    excerpts = excerpts_of(runs, 'triangle')
     swing = max(e.swing for e in excerpts)
     excursion = float(np.ptp(run.u[start:stop]))
     r = fine_thresholds(swing, excursion)

@@ -22,7 +22,7 @@ from piezo_ident.identification.errors import (
     squares_left,
     with_fine_plays,
 )
-from piezo_ident.identification.prepare import Excerpt, Run
+from piezo_ident.identification.prepare import Excerpt, excerpts_of, Run
 from piezo_ident.identification.results import FitOutcome, Steps
 from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.starts import lag_of, with_starts
@@ -31,7 +31,6 @@ from piezo_ident.identification.step2_dynamics import (
     beside_law,
     DynamicsResult,
     second_step,
-    triangle_excerpts,
     without_pairs,
 )
 from piezo_ident.identification.step3_choice import Means, third_step, WORTH
@@ -45,21 +44,6 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 AS_WELL = 0.01
 #: largest orders that are tried besides `Settings.max_order` if G has such a pair
 SMALLER = (8, 4)
-
-
-def small_excerpts(runs: Sequence[Run]) -> list[Excerpt]:
-    """Cut out steps and noise, which judge H by small motion."""
-    uses = [run.mask('step', 'settle', 'noise') & run.known & ~run.held_out() for run in runs]
-    return [
-        Excerpt(run.u, run.x, use, run.memory)
-        for run, use in zip(runs, uses, strict=True)
-        if use.any()
-    ]
-
-
-def motion_excerpts(runs: Sequence[Run]) -> list[Means]:
-    """Cut out all motion for fitting H, without the held-out blocks."""
-    return [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
 
 
 def model_of(
@@ -134,13 +118,13 @@ class _LabelledFitter:
         settings, progress, delay = self.settings, self.progress, self.delay
         # fit the starts again with the lag of this G
         runs = with_starts(self.runs, lag_of(G, delay))
-        fit, held = triangle_excerpts(runs), triangle_excerpts(runs, held=True)
-        small = small_excerpts(runs)
+        fit, held = (excerpts_of(runs, 'triangle', held=held) for held in (False, True))
+        small = excerpts_of(runs, 'step', 'settle', 'noise')
         fitted_to: Sequence[Excerpt] = fit
         hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
         model = model_of(self.rate, self.scaling, hysteresis, G, delay)
         if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
-            motion = motion_excerpts(runs)
+            motion = [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
             other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
             left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
             if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):

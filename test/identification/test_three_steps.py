@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import STAGE as PAPER
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.prepare import runs_of, scaling_of
+from piezo_ident.identification.prepare import excerpts_of, runs_of, scaling_of
 from piezo_ident.identification.settings import Settings, silent
 from piezo_ident.identification.step1_delay import first_step
-from piezo_ident.identification.step2_dynamics import beside_law, second_step, triangle_excerpts
+from piezo_ident.identification.step2_dynamics import beside_law, second_step
 from piezo_ident.identification.step3_hysteresis import factorise, fit_hysteresis
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.record.record import Piece, Record, Segment
@@ -83,7 +83,7 @@ def test_dynamics_are_refined_where_they_do_not_suit_h():
     given, delay, r = runs(record()), Delay(3), PAPER.model.hysteresis.thresholds
     found, _ = second_step(given, delay, Settings(order=(10, 10)), silent)
     truth = PAPER.model.dynamics.normalised()
-    H = fit_hysteresis(factorise(triangle_excerpts(given), r, truth, delay), r).hysteresis
+    H = fit_hysteresis(factorise(excerpts_of(given, 'triangle'), r, truth, delay), r).hysteresis
     # a tenth of it answers through a slower pole
     slow = np.array([-np.exp(-2 * np.pi * 300 / 2e4)])
     b = 0.9 * np.convolve(truth.b, [1.0, *slow]) + 0.1 * (1 + slow[0]) * np.pad(truth.b, (0, 1))
@@ -153,7 +153,7 @@ def test_fitted_and_held_out_triangles_are_the_same_runs():
         )
     )
     made = runs(slow, quick)
-    fit, held = triangle_excerpts(made), triangle_excerpts(made, held=True)
+    fit, held = excerpts_of(made, 'triangle'), excerpts_of(made, 'triangle', held=True)
     assert len(fit) == len(held) == 2
     assert not held[1].use.any()
     for one, two in zip(fit, held, strict=True):
