@@ -53,7 +53,7 @@ SIZES = {
     'cli': (2100, 12),
     'common': (900, 8),
     'excitation': (1100, 6),
-    'identification': (5000, 20),
+    'identification': (4400, 18),
     'many': (800, 6),
     'operators': (1900, 10),
     'record': (2800, 11),
