@@ -52,7 +52,7 @@ test-graph: .venv/.test
 test-jazzy: .venv-jazzy/.test
 	.venv-jazzy/bin/pytest -p no:cacheprovider --ignore=test/nodes $(PYTEST_ARGS)
 
-# a warning is an error; test/test_site.py builds it the same way
+# a warning is an error; test/house/test_site.py builds it the same way
 docs: .venv-docs/.docs
 	.venv-docs/bin/sphinx-build -q -W --keep-going -b html docs build/site
 	@echo build/site/index.html
@@ -144,7 +144,7 @@ crash: .venv/.test
 
 # no voltage of the inverse leaves its limits, in 10,000 random references: some minutes
 limits: .venv/.test
-	REFERENCES=10000 .venv/bin/pytest test/control/test_inverse_properties.py -k limits_are_kept
+	REFERENCES=10000 .venv/bin/pytest test/control/whole/test_inverse_properties.py -k limits_are_kept
 
 # what a ROS workspace would do, without ROS; and every node starts from there
 colcon: .venv/.colcon

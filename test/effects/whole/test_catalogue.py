@@ -382,7 +382,7 @@ def test_trials_of_an_effect_that_only_declares_are_a_product():
 
 
 def test_the_page_has_a_row_for_each_name_with_what_it_needs():
-    page = Path(__file__).resolve().parents[2] / 'docs/diagnosis.md'
+    page = Path(__file__).resolve().parents[3] / 'docs/diagnosis.md'
     body = page.read_text(encoding='utf-8').partition('<!-- table: names -->')[2]
     rows = [
         [cell.strip() for cell in line.split('|')[1:-1]]

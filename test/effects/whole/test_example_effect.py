@@ -20,8 +20,8 @@ from piezo_ident.model.files import model_to_dict
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[2]
-EXAMPLE = Path(__file__).parents[1] / 'example_effect'
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLE = Path(__file__).parents[2] / 'example_effect'
 
 #: in a fresh interpreter: what the catalogue has, and what a model file with the effect predicts
 SCRIPT = """
