@@ -22,19 +22,19 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 SLOWEST = (
     'diagnosis/test_diagnose.py',
     'identification/test_identify.py',
-    'verbs/test_several_axes.py',
+    'verbs/whole/test_several_axes.py',
     'diagnosis/test_two_effects.py',
     'examples/test_tutorial.py',
     'identification/test_free_run_fit.py',
     'examples/test_demo.py',
-    'control/test_inverse_identified.py',
-    'test_site.py',
-    'nodes/test_diagnose_node.py',
-    'nodes/test_run_faults.py',
-    'nodes/test_whole_graph.py',
-    'nodes/test_identifier_node.py',
-    'nodes/test_driver_example.py',
-    'nodes/test_faults.py',
+    'control/whole/test_identified_inverse.py',
+    'house/test_site.py',
+    'nodes/whole/test_diagnose_node.py',
+    'nodes/whole/test_run_faults.py',
+    'nodes/whole/test_whole_graph.py',
+    'nodes/identifier/test_node.py',
+    'nodes/whole/test_driver_example.py',
+    'nodes/whole/test_faults.py',
 )
 #: a PNG of one white pixel
 BLANK = bytes.fromhex(

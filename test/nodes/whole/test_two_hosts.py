@@ -12,7 +12,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 import netns
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 REASON = netns.why_not()
 two_hosts = pytest.mark.skipif(bool(REASON), reason=REASON or 'there are two hosts')
 

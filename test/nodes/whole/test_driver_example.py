@@ -17,7 +17,7 @@ from graph import Graph, Handle
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.record.blocks import Samples
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / 'examples/daq_driver.py'
 FS = 20_000.0
 #: longer than a busy machine keeps a test from its next block

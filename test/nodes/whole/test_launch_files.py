@@ -19,7 +19,7 @@ from piezo_ident.nodes.parameters import NODES
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 class Substitution:

@@ -15,7 +15,7 @@ import piezo_ident as pi
 from piezo_ident.model.observer import observe
 from processes import take_domain
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 MOTIONS = """
 limits: [0, 10]
 sample_rate: 20000

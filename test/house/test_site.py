@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip('sphinx')
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+DOCS = Path(__file__).resolve().parents[2] / 'docs'
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
