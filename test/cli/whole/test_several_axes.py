@@ -19,7 +19,7 @@ def folder(tmp_path_factory):
     """Return a folder with records of two axes, and the model of their stage."""
     made, rng = tmp_path_factory.mktemp('axes'), np.random.default_rng(0)
     for name in ('learn', 'both'):
-        pi.write(play(sweeps(4000, rng), sweeps(4000, rng)), made / f'{name}.npz')
+        pi.write(play(sweeps(2000, rng), sweeps(2000, rng)), made / f'{name}.npz')
     pi.write(play(*raster(3000), seed=2), made / 'raster.npz')
     scanner().save(made / 'stage.yaml')
     return made
@@ -28,19 +28,13 @@ def folder(tmp_path_factory):
 def test_identify_and_diagnose_write_the_model_of_all_axes(capsys, folder, tmp_path):
     model, refined = tmp_path / 'model.yaml', tmp_path / 'refined.yaml'
     learn, scan = folder / 'learn.npz', folder / 'raster.npz'
-    words = ['identify', learn, '--validation', scan, '--model', model, '--thresholds', '8']
+    words = ['identify', learn, '--validation', scan, '--model', model]
+    words += ['--thresholds', '8', '--order', '1,1', '--delay', '1']
     data = json.loads(succeed(capsys, *words, '--json'))
     assert list(data['axes']) == ['y', 'y_b']
     assert data['validation'][0]['axes']['y_b']['whole']['percent_of_stroke'] > 0.1
-    words = [
-        'diagnose',
-        model,
-        folder / 'both.npz',
-        '--only',
-        'cross_coupling',
-        '--model',
-        refined,
-    ]
+    words = ['diagnose', model, folder / 'both.npz', '--only', 'cross_coupling']
+    words += ['--model', refined]
     said = succeed(capsys, *words, '--report', tmp_path / 'report')
     assert 'motion_b' in said and str(refined) in said
     assert list(pi.load(refined).axes) == ['y', 'y_b']

@@ -38,7 +38,7 @@ segments:
 
 @pytest.fixture(scope='module')
 def record():
-    text = identification_program(slew=100, steps=8, cycles=8, noise=0.5, slope=60)
+    text = identification_program(slew=100, steps=8, hold=0.02, cycles=4, noise=0.3, slope=100)
     program = parse_program(text)
     return STAGE.play(program, np.random.default_rng(0))
 

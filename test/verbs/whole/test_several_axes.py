@@ -34,15 +34,15 @@ int main(void)
     return 0;
 }
 """
-#: saves the choice of a number
-FEW = pi.Settings(thresholds=8)
+#: saves the choice of numbers
+FEW = pi.Settings(thresholds=8, order=(1, 1))
 ONLY_PATHS = pi.DiagnosisSettings(effects=('cross_coupling', 'backlash'))
 
 
 @pytest.fixture(scope='module')
 def one_by_one():
     rng = np.random.default_rng(0)
-    first, second, rest = sweeps(6000, rng), sweeps(6000, rng), np.zeros(6000)
+    first, second, rest = sweeps(3000, rng), sweeps(3000, rng), np.zeros(3000)
     v, v_b = np.concatenate([first, rest]), np.concatenate([rest, second])
     return pi.identify(play(v, v_b, name='one by one'), FEW)
 
@@ -50,7 +50,7 @@ def one_by_one():
 @pytest.fixture(scope='module')
 def diagnosed(one_by_one):
     rng = np.random.default_rng(1)
-    both = play(sweeps(6000, rng), sweeps(6000, rng), seed=1, name='both')
+    both = play(sweeps(3000, rng), sweeps(3000, rng), seed=1, name='both')
     return pi.diagnose(one_by_one.model, both, ONLY_PATHS)
 
 
