@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import line_between
 from piezo_ident.common.errors import ModelError
-from piezo_ident.live.axes.run import AxesRun, channels_of, check_axes
+from piezo_ident.live.axes_run import AxesRun, channels_of, check_axes
 from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import Kind

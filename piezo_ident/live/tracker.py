@@ -2,89 +2,62 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Turn a reference into a voltage, block by block, through new references and new models.
+Turn the reference of a stage into its voltage, block by block.
 
-The tracker joins a new reference along a raised cosine in metres, from the position of the stage.
-A new model takes over in the state that it would have if it had run from the start.  The tracker
-then joins the reference from the position that the new model predicts, so the voltage does not
-jump.  A guard limits the voltage in the end.
+An `AxisDrive` moves each axis by its own voltage.  In a stage of several axes, the goal of this
+motion is the wanted motion less what the paths from the other axes add.  The motion of the other
+axes is the wanted one at first, then the goal of the round before, as in `piezo_ident.invert`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-import math
-import threading
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.errors import DataError
 from piezo_ident.control.inputs import FAR
-from piezo_ident.control.live_inverse import LiveInverse, PREVIEW
-from piezo_ident.live.axes.join import held
+from piezo_ident.control.live_inverse import PREVIEW
+from piezo_ident.effects import find_effect
+from piezo_ident.live.axes_run import check_axes
+from piezo_ident.live.axis_drive import AxisDrive, Drive, Successor
 from piezo_ident.live.follower import Follower
-from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.history import History
+from piezo_ident.model.multi_axis import alone, models_of, MOTION, motion_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.model.stream import Stream
+from piezo_ident.operators.chain import Block
 from piezo_ident.record.blocks import Samples
 
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """
-    Voltage for a block of a reference.
-
-    Attributes
-    ----------
-    t, v, wanted : ndarray, shape (n,)
-        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
-    clipped : int
-        Number of samples at which a limit keeps the stage from the wanted displacement.
-    """
-
-    t: Array
-    v: Array
-    wanted: Array
-    clipped: int
-
-
-@dataclass(frozen=True, eq=False)
-class Successor:
-    """Inverse of a new model after `count` samples of voltage, and a free run of the model."""
-
-    inverse: LiveInverse
-    count: int
-    run: Stream | None = None
+#: rounds over the paths: each leaves a share of the error that is the size of a path, 0.5 .. 3 %
+ROUNDS = 3
 
 
 class Tracker:
     """
-    Follows a reference with a model.
+    Follows the reference of a stage with a model.
 
-    The stage is at rest before the first block.
+    The stage is at rest before the first block.  Arrays of several axes have a row for each axis.
 
     Parameters
     ----------
-    model : StageModel
+    model : StageModel or MultiAxisModel
     settings : GuardSettings
-        At the rate of the model.
+        Limits and slew of each axis, at the rate of the model.
     preview : int, optional
         Samples by which the stage follows the reference later.
     follow : {'off', 'offset', 'gain'}, optional
-        Corrections by measured displacement: none, offset and creep from earlier motion, or these
-        and the gain of the stage.
-
-    Attributes
-    ----------
-    follower : Follower or None
-        Corrects the wanted motion; None if `follow` is ``'off'``.
+        Corrections of a single axis by measured displacement: none, offset and creep from earlier
+        motion, or these and the gain of the stage.
+    axes : sequence of str, optional
+        Order of the rows, by the names of the displacements.
 
     Raises
     ------
     DataError, ModelError
-        When the model has no inverse within these limits; see `LiveInverse`.
+        When an axis has no inverse within these limits; see `LiveInverse`.
 
     Examples
     --------
@@ -99,85 +72,59 @@ class Tracker:
 
     def __init__(
         self,
-        model: StageModel,
+        model: StageModel | MultiAxisModel,
         settings: GuardSettings,
         preview: int = PREVIEW,
         follow: str = 'off',
+        axes: Sequence[str] = ('y',),
     ) -> None:
         self.settings, self.preview, self.follow = settings, preview, follow
-        self._inverse = self._built(model)
-        # what other axes move of this axis at rest [m]
-        self.rest_shift = 0.0
-        self._lock = threading.Lock()
-        self.reset()
+        single = alone(model)
+        self._each = [AxisDrive(single[axis], settings, preview, follow) for axis in axes]
+        self._paths = list[_Paths]()
+        if isinstance(model, MultiAxisModel):
+            self._paths = [_Paths(model, axes) for _ in range(ROUNDS)]
+            rest = np.array([[one.inverse.position] for one in self._each])
+            for one, shift in zip(self._each, self._paths[0].process(rest)[:, 0], strict=True):
+                one.rest_shift = float(shift)
+            self.reset()
 
     def reset(self) -> None:
-        """Begin at rest, with the clock of the voltage at zero."""
-        self._guard, self._past = Guard(self.settings), History()
-        self._inverse.reset()
-        start = self._inverse.position + self.rest_shift
-        self._raw = self._wanted = np.full(self.preview, start)
-        self._join = _Join(start, self._step())
-        self.follower = self._new_follower()
-
-    def _new_follower(self, stream: Stream | None = None) -> Follower | None:
-        if self.follow == 'off':
-            return None
-        before = None if stream is None else self.follower
-        known = before is not None and before.corrector.knows_memory
-        gain, model = self.follow == 'gain', self._inverse.model
-        return Follower(model, gain, self._step(), (stream or model.stream(), self.tick), known)
+        """Begin at rest, with the clock of the voltages at zero."""
+        for one in self._each:
+            one.reset()
+        for paths in self._paths:
+            paths.reset()
 
     @property
-    def inverse(self) -> LiveInverse:
-        """The inverse of the model that is followed."""
-        return self._inverse
-
-    @property
-    def passes(self) -> int:
-        """Number of passes of the inverse."""
-        return self._inverse.passes
-
-    @property
-    def expected(self) -> float:
-        """Error that the finite preview leaves [% of stroke]."""
-        return self._inverse.error
-
-    @property
-    def last_reference(self) -> float:
-        """The last sample of the reference [m]."""
-        return float(self._raw[-1])
+    def follower(self) -> Follower | None:
+        """What corrects the wanted motion; None if `follow` is ``'off'``."""
+        return self._each[0].follower
 
     @property
     def rest(self) -> list[float]:
-        """Displacement at rest, as `AxesTracker` lists those of its axes [m]; after `reset`."""
-        return [self.last_reference]
+        """Displacement of each axis at rest [m]; after `reset`."""
+        return [one.last_reference for one in self._each]
+
+    @property
+    def passes(self) -> int:
+        """Largest number of passes of the inverses."""
+        return max(one.inverse.passes for one in self._each)
+
+    @property
+    def expected(self) -> float:
+        """Largest error that the finite preview leaves [% of stroke]."""
+        return max(one.inverse.error for one in self._each)
 
     @property
     def tick(self) -> int:
         """Samples sent so far."""
-        return self._past.count
+        return self._each[0].tick
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the voltage of rest was sent last."""
-        return self._guard.is_at_rest
-
-    def _built(self, model: StageModel) -> LiveInverse:
-        s = self.settings
-        if abs(model.sample_rate / s.sample_rate - 1.0) > 1e-6:
-            raise ModelError(
-                f'the reference is sampled at {s.sample_rate:g} Hz, the model holds for '
-                f'{model.sample_rate:g} Hz; identify a model at the rate of the reference'
-            )
-        return LiveInverse(
-            model, limits=(s.low, s.high), slew=s.slew, preview=self.preview, rest=s.rest
-        )
-
-    def _step(self) -> float:
-        """Return the largest change from one sample of a ramp to the next [m]."""
-        scaling = self._inverse.model.scaling
-        return self.settings.ramp_step * abs(scaling.Y / scaling.V)
+        """Whether the voltage of rest was sent last on every axis."""
+        return all(one.is_at_rest for one in self._each)
 
     def process(self, reference: ArrayLike, restarted: bool = False) -> Drive:
         """
@@ -187,7 +134,7 @@ class Tracker:
 
         Parameters
         ----------
-        reference : array_like, shape (n,)
+        reference : array_like, shape (n,), or (k, n) for k axes
             [m]
         restarted : bool, optional
             Whether a new stream begins here, which has to be joined.
@@ -197,110 +144,86 @@ class Tracker:
         Drive
             As many samples of voltage; each belongs to the reference `preview` samples before.
         """
-        wanted = self.joined(reference, restarted)
-        return self.drive(wanted, self._corrected(wanted))
-
-    def joined(self, reference: ArrayLike, restarted: bool = False) -> Array:
-        """Join the next samples of a reference, as `process` does, to a wanted motion [m]."""
-        raw = np.asarray(reference, dtype=np.float64)
-        if raw.ndim != 1 or not raw.size:
-            raise DataError('a block of a reference is a vector of at least one number')
-        if restarted:
-            self._join = _Join(self._join.last, self._step())
-        self._raw = np.append(self._raw, raw)[-self.preview :]
-        return self._join.process(raw)
-
-    def drive(self, wanted: Array, goal: Array) -> Drive:
-        """Drive the model along a goal [m], which moves the stage along the wanted motion [m]."""
-        self._wanted = np.append(self._wanted, wanted)
-        driven = self._inverse.process(goal)
-        v = self._guard.process(driven.v).voltage
-        now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
-        return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
-
-    def _corrected(self, wanted: Array) -> Array:
-        """Correct a wanted motion by the measured error of the stage."""
-        if self.follower is None:
-            return wanted
-        return self.follower.process(wanted, self.preview + 1)
+        rows = zip(self._each, np.atleast_2d(reference), strict=True)
+        wanted = np.stack([one.joined(row, restarted) for one, row in rows])
+        goals = wanted
+        for paths in self._paths:
+            goals = wanted - paths.process(goals)
+        drives = [one.drive(*x) for one, *x in zip(self._each, wanted, goals, strict=True)]
+        v, now = (_rows([getattr(drive, x) for drive in drives]) for x in ('v', 'wanted'))
+        return Drive(drives[0].t, v, now, sum(drive.clipped for drive in drives))
 
     def measured(self, samples: Samples) -> None:
-        """Take a block of displacement [m], on the clock of the voltage."""
-        if self.follower is not None:
-            self.follower.measured(samples)
+        """Take a block of displacement of the first axis [m], on the clock of the voltage."""
+        self._each[0].measured(samples)
 
     def finish(self) -> Drive:
         """Make the voltage for the rest of the reference, whose last sample is repeated."""
-        return self.process(np.full(self.preview, self.last_reference))
+        return self.process(np.repeat([[x] for x in self.rest], self.preview, axis=1))
 
     def play(self, v: Array) -> tuple[Array, Array]:
-        """Send a given voltage, joined softly and limited; return its time and voltage."""
-        v = self._guard.process(v).voltage
-        return self._sent(v), v
+        """Send a given voltage of a single axis, limited; return its time and voltage."""
+        return self._each[0].play(v)
 
     def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
         """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
-        v = self._guard.idle(n, longest)
-        return self._sent(v), v
+        ramps = [one.idle(n, longest) for one in self._each]
+        return ramps[0][0], _rows([v for _, v in ramps])
 
     def hurry(self) -> None:
-        """Begin a ramp to rest anew, so that `idle` can shorten it."""
-        self._guard = Guard(self.settings, self._guard.applied)
+        """Begin the ramps to rest anew, so that `idle` can shorten them."""
+        for one in self._each:
+            one.hurry()
 
-    def _sent(self, v: Array) -> Array:
-        t = np.arange(self.tick, self.tick + v.size) / self.settings.sample_rate
-        if v.size:
-            with self._lock:
-                self._past.add(t, v)
-            if self.follower is not None:
-                self.follower.drove(t, v)
-        return t
-
-    # another model
-
-    def successor(self, model: StageModel, past: History) -> Successor:
-        """
-        Bring a model into the state after the voltage so far; any thread may call this.
-
-        Parameters
-        ----------
-        model : StageModel
-        past : History
-            A snapshot, see `past`.
-        """
-        inverse, run = self._built(model), None
-        if past:
-            period = 1.0 / self.settings.sample_rate
-            _, v = past.recall(inverse, model, period)
-            inverse.follow(v, past.count - v.size)
-            if self.follow != 'off':
-                run = inverse.model.stream()
-                run.process(*past.recall(run, inverse.model, period)[::-1])
-        return Successor(inverse, past.count, run)
+    # another model of a single axis
 
     def past(self) -> History:
         """Return a snapshot of the voltage so far; any thread may call this."""
-        with self._lock:
-            return self._past.snapshot()
+        return self._each[0].past()
+
+    def successor(self, model: StageModel, past: History) -> Successor:
+        """Bring a model into the state after a `past`; any thread may call this."""
+        return self._each[0].successor(model, past)
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
-        self._inverse = successor.inverse
-        if not self.tick:
-            self.reset()
-            return
-        run = successor.run
-        if self.tick > successor.count:
-            v = self._past.since(successor.count)
-            self._inverse.follow(v, successor.count)
-            if run is not None:
-                t = np.arange(successor.count, self.tick) / self.settings.sample_rate
-                run.process(v, t)
-        self.follower = self._new_follower(run)
-        # the voltage is moving, so the joined motion must move from its first sample
-        self._join = _Join(self._inverse.position, self._step(), moves=True)
-        self._wanted = self._join.process(self._raw)
-        self._inverse.process(self._wanted)
+        self._each[0].take_over(successor)
+
+
+def _rows(of_axes: list[Array]) -> Array:
+    """Give several axes a row each; a single axis stays a vector."""
+    return np.stack(of_axes) if of_axes[1:] else of_axes[0]
+
+
+#: a model with its tracker, or with what takes over from the tracker at work
+Prepared: TypeAlias = tuple[StageModel | MultiAxisModel, Tracker | Successor]
+
+
+def prepared(
+    model: StageModel | MultiAxisModel,
+    axes: Sequence[str],
+    settings: GuardSettings,
+    preview: int,
+    follow: str,
+    now: Tracker | None,
+) -> Prepared:
+    """
+    Prepare another model for the axes of a node; any thread may call this.
+
+    A model of one axis becomes the successor of the tracker at work, `now`, if that one has the
+    same settings.
+
+    Raises
+    ------
+    ModelError
+        When the model has other axes.
+    """
+    check_axes(model, axes)
+    if not axes[1:]:
+        (model,) = models_of(model).values()
+        if now is not None and (now.settings, now.follow) == (settings, follow):
+            return model, now.successor(model, now.past())
+    return model, Tracker(model, settings, preview, follow, axes)
 
 
 def check_unit(model: StageModel, x: Array) -> None:
@@ -314,48 +237,36 @@ def check_unit(model: StageModel, x: Array) -> None:
         )
 
 
-class _Join:
-    """
-    Joins a reference along a raised cosine.
+class _Paths:
+    """What each axis feels of the motions of the others by their own voltages [m]."""
 
-    Parameters
-    ----------
-    start : float
-        Position of the stage [m].
-    step : float
-        Largest change by the cosine from one sample to the next [m].
-    moves : bool, optional
-        Whether the stage already moves along the reference.  The distance between them then fades
-        out.  From rest the reference fades in instead, so the sum never leaves the range of both.
+    def __init__(self, model: MultiAxisModel, axes: Sequence[str]) -> None:
+        self._model, self._axes = model, tuple(axes)
+        self.reset()
 
-    Attributes
-    ----------
-    last : float
-        The last sample [m].
-    """
+    def reset(self) -> None:
+        """Come to rest under the next sample."""
+        models = [self._model.axes[axis] for axis in self._axes]
+        self._operators = [
+            [
+                find_effect(e.name)(x.sample_rate, e.parameters)
+                for e in x.effects
+                if e.channel.startswith(MOTION)
+            ]
+            for x in models
+        ]
+        self._spans = [x.scaling.Y for x in models]
+        for operator in (one for row in self._operators for one in row):
+            operator.reset(0.0, 0.0)
 
-    def __init__(self, start: float, step: float, moves: bool = False) -> None:
-        self.last = self._start = start
-        # no sample of the reference is known yet
-        self._command = math.nan
-        self._step, self._moves = step, moves
-        self._length, self._done = -1, 0
-        self._distance = 0.0
-
-    def process(self, x: Array) -> Array:
-        """Join the next samples; a sample that is NaN or infinite repeats the last sample."""
-        x = held(x, self._command)
-        self._command = float(x[-1])
-        if not math.isfinite(self._command):
-            return np.full(x.size, self.last)
-        if self._length < 0:
-            before = 2.0 * x[0] - x[1] if self._moves and x.size > 1 else x[0]
-            self._distance = self._start - float(before)
-            self._length = math.ceil(2.0 * abs(self._distance) / self._step)
-        if self._done < self._length:
-            tau = np.minimum((self._done + np.arange(x.size)) / self._length, 1.0)
-            left = 1.0 - tau + np.sin(2.0 * np.pi * tau) / (2.0 * np.pi)
-            self._done += x.size
-            x = x + (self._distance if self._moves else self._start - x) * left
-        self.last = float(x[-1])
-        return x
+    def process(self, moved: Array) -> Array:
+        """Pass the next motions [m] through the paths; shapes (k, n)."""
+        channels = {motion_of(a): row for a, row in zip(self._axes, moved, strict=True)}
+        still = np.zeros(moved.shape[1])
+        felt = []
+        for operators, span in zip(self._operators, self._spans, strict=True):
+            block = Block(t=still, v=still, x=still, channels=channels)
+            for operator in operators:
+                block = operator.process(block)
+            felt.append(span * block.x)
+        return np.stack(felt)

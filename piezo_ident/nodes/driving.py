@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import ConfigError, PiezoIdentError
-from piezo_ident.live.axes.tracker import AxesTracker
 from piezo_ident.live.guard import LAST_RAMP
 from piezo_ident.live.pacing import Pace
 from piezo_ident.live.tracker import Tracker
@@ -48,7 +47,7 @@ class DrivingNode(LabNode):
         self._caveats = ''
         super().__init__(**kwargs)
         self._rate_of_clock = self.values['sample_rate']
-        self._tracker: Tracker | AxesTracker | None = None
+        self._tracker: Tracker | None = None
         # the reason for refusing the last model
         self._refusal = ''
         self._faults = RecentFaults()
@@ -67,7 +66,7 @@ class DrivingNode(LabNode):
         """Do the due work; return the next state if the right to drive has just come."""
         return ''
 
-    def _take_right(self, tracker: Tracker | AxesTracker) -> None:
+    def _take_right(self, tracker: Tracker) -> None:
         """Ask for the right to drive."""
         tracker.reset()
         self._faults.clear()
@@ -137,7 +136,7 @@ class DrivingNode(LabNode):
         else:
             self.report_state()
 
-    def _send_ramp(self, tracker: Tracker | AxesTracker) -> None:
+    def _send_ramp(self, tracker: Tracker) -> None:
         if (due := self._pace.due()) > 0:
             self._send(*tracker.idle(due), 'ramp:stop')
 

@@ -45,14 +45,14 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import ConfigError, DataError
-from piezo_ident.live.axes.reference import Reference, TrackingErrors
-from piezo_ident.live.axes.tracker import AxesTracker, Prepared, prepared
+from piezo_ident.live.axis_drive import Drive, Successor
 from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.pacing import Looks, Rate
+from piezo_ident.live.reference import Reference, TrackingErrors
 from piezo_ident.live.sample_clock import Kind, SampleClock
-from piezo_ident.live.tracker import check_unit, Drive, Successor, Tracker
+from piezo_ident.live.tracker import check_unit, Prepared, prepared, Tracker
 from piezo_ident.model.multi_axis import models_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
@@ -158,7 +158,7 @@ class FeedforwardNode(DrivingNode):
         self._model, new = loaded
         if not isinstance(new, Successor):
             self._tracker = new
-        elif isinstance(self._tracker, Tracker):
+        elif self._tracker is not None:
             self._tracker.take_over(new)
         self._source, self._refusal = source, ''
         self._models += 1
@@ -193,7 +193,7 @@ class FeedforwardNode(DrivingNode):
         self._learner = Learner(make, self.values['repetitions'], self._played)
         return f'the last reference, {x.size / self._rate_of_clock:.3g} s, is repeated'
 
-    def _begin(self) -> Tracker | AxesTracker:
+    def _begin(self) -> Tracker:
         """Take the right to drive."""
         if self._state in DRIVING:
             raise ConfigError(f'the node drives already: {NOW[self._state]}; call ~/stop first')
@@ -264,8 +264,7 @@ class FeedforwardNode(DrivingNode):
             self._answered = self._last
         if (tracker := self._tracker) is not None:
             self._counts['streams'] += is_new
-            wanted = x if self._tails[1:] else x[0]
-            self._play(tracker.process(wanted, is_new and self._state == 'tracking'))
+            self._play(tracker.process(x, is_new and self._state == 'tracking'))
             self._state = 'tracking'
 
     def _play(self, drive: Drive) -> None:
@@ -300,7 +299,7 @@ class FeedforwardNode(DrivingNode):
         self._tell(self._errors.measured(tail, samples))
         if self._learner is not None:
             self._learner.measured(samples)
-        if isinstance(self._tracker, Tracker):
+        if self._tracker is not None:
             self._tracker.measured(samples)
 
     def _tell(self, errors: list[Samples]) -> None:
@@ -315,7 +314,7 @@ class FeedforwardNode(DrivingNode):
         tracker, learner = self._tracker, self._learner
         if self._state == 'waiting' or tracker is None:
             return 'learning' if learner else 'ready'
-        if self._state == 'learning' and learner is not None and isinstance(tracker, Tracker):
+        if self._state == 'learning' and learner is not None:
             self._repeat(tracker, learner)
         elif self._state == 'tracking':
             self._take_complete()

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.fitting.adaptation import Recalled
-from piezo_ident.live.axes.comparison import AxisComparison, finite_readings
-from piezo_ident.live.axes.join import Join
-from piezo_ident.live.axes.run import AxesRun
+from piezo_ident.live.axes_run import AxesRun
+from piezo_ident.live.comparison import AxisComparison, finite_readings
 from piezo_ident.live.corrector import Corrector
+from piezo_ident.live.join import Join
 from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
 from piezo_ident.live.predictor import Predictor, warm_up

@@ -56,8 +56,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.live.axes.join import Join
 from piezo_ident.live.guard import Applied, Guard, GuardSettings, LAST_RAMP
+from piezo_ident.live.join import Join
 from piezo_ident.live.pacing import Looks, Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.two_axis_stage import load_stage

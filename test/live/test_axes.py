@@ -6,10 +6,10 @@
 from axes_scanner import RATE, scanner, sweeps
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.live.axes.join import Join
-from piezo_ident.live.axes.tracker import AxesTracker
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.join import Join
 from piezo_ident.live.predictor import Predictor
+from piezo_ident.live.tracker import Tracker
 from piezo_ident.record.blocks import Samples
 import pytest
 
@@ -116,7 +116,7 @@ def motions(n=4000):
 
 
 def test_all_axes_follow_their_references_with_the_paths_made_up_for():
-    tracker, wanted = AxesTracker(scanner(), AXES, LIMITS, 60), motions()
+    tracker, wanted = Tracker(scanner(), LIMITS, 60, axes=AXES), motions()
     drives = [tracker.process(wanted[:, k : k + 50], k == 0) for k in range(0, 4000, 50)]
     drives.append(tracker.finish())
     v, now = (np.hstack([getattr(d, x) for d in drives]) for x in ('v', 'wanted'))
@@ -135,7 +135,7 @@ def test_all_axes_follow_their_references_with_the_paths_made_up_for():
 
 def test_limits_and_slew_hold_on_every_axis():
     settings = GuardSettings(0.0, 6.0, 100.0, 20.0, 0.0, RATE)
-    tracker, wanted = AxesTracker(scanner(), AXES, settings, 60), 3.0 * motions()
+    tracker, wanted = Tracker(scanner(), settings, 60, axes=AXES), 3.0 * motions()
     drives = [tracker.process(wanted[:, k : k + 50], k == 0) for k in range(0, 3000, 50)]
     v = np.hstack([d.v for d in drives])
     assert sum(d.clipped for d in drives) > 0

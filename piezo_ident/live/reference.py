@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 from piezo_ident.common.arrays import Array, line_between
-from piezo_ident.live.axes.join import held, Join
+from piezo_ident.live.join import held, Join
 from piezo_ident.live.monitor import TrackingError
 from piezo_ident.live.sample_clock import Kind, Verdict
 from piezo_ident.record.blocks import Samples

@@ -1,0 +1,262 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Drive one axis along a wanted motion, block by block, through new references and new models.
+
+The axis joins a new reference along a raised cosine in metres, from the position of the stage.
+A new model takes over in the state that it would have if it had run from the start.  The axis
+then joins the reference from the position that the new model predicts, so the voltage does not
+jump.  A guard limits the voltage in the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+import threading
+
+import numpy as np
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.control.live_inverse import LiveInverse
+from piezo_ident.live.follower import Follower
+from piezo_ident.live.guard import Guard, GuardSettings
+from piezo_ident.live.history import History
+from piezo_ident.live.join import held
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
+from piezo_ident.record.blocks import Samples
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """
+    Voltage for a block of a reference; several axes have a row each.
+
+    Attributes
+    ----------
+    t, v, wanted : ndarray, shape (n,)
+        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
+    clipped : int
+        Number of samples at which a limit keeps the stage from the wanted displacement.
+    """
+
+    t: Array
+    v: Array
+    wanted: Array
+    clipped: int
+
+
+@dataclass(frozen=True, eq=False)
+class Successor:
+    """Inverse of a new model after `count` samples of voltage, and a free run of the model."""
+
+    inverse: LiveInverse
+    count: int
+    run: Stream | None = None
+
+
+class AxisDrive:
+    """
+    Drives one axis with its model; parameters and errors as for `Tracker`.
+
+    Attributes
+    ----------
+    inverse : LiveInverse
+    follower : Follower or None
+        Corrects the goal by the measured error; None if `follow` is ``'off'``.
+    rest_shift : float
+        What other axes move of this axis at rest [m]; used by the next `reset`.
+    """
+
+    def __init__(
+        self, model: StageModel, settings: GuardSettings, preview: int, follow: str
+    ) -> None:
+        self._settings, self._preview, self._follow = settings, preview, follow
+        self.inverse = self._built(model)
+        self.rest_shift = 0.0
+        self._lock = threading.Lock()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at rest, with the clock of the voltage at zero."""
+        self._guard, self._past = Guard(self._settings), History()
+        self.inverse.reset()
+        start = self.inverse.position + self.rest_shift
+        self._raw = self._wanted = np.full(self._preview, start)
+        self._join = _Join(start, self._step())
+        self.follower = self._new_follower()
+
+    def _new_follower(self, stream: Stream | None = None) -> Follower | None:
+        if self._follow == 'off':
+            return None
+        before = None if stream is None else self.follower
+        known = before is not None and before.corrector.knows_memory
+        gain, model = self._follow == 'gain', self.inverse.model
+        return Follower(model, gain, self._step(), (stream or model.stream(), self.tick), known)
+
+    @property
+    def last_reference(self) -> float:
+        """The last sample of the reference [m]."""
+        return float(self._raw[-1])
+
+    @property
+    def tick(self) -> int:
+        """Samples sent so far."""
+        return self._past.count
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the voltage of rest was sent last."""
+        return self._guard.is_at_rest
+
+    def _built(self, model: StageModel) -> LiveInverse:
+        s = self._settings
+        if abs(model.sample_rate / s.sample_rate - 1.0) > 1e-6:
+            raise ModelError(
+                f'the reference is sampled at {s.sample_rate:g} Hz, the model holds for '
+                f'{model.sample_rate:g} Hz; identify a model at the rate of the reference'
+            )
+        return LiveInverse(
+            model, limits=(s.low, s.high), slew=s.slew, preview=self._preview, rest=s.rest
+        )
+
+    def _step(self) -> float:
+        """Return the largest change from one sample of a ramp to the next [m]."""
+        scaling = self.inverse.model.scaling
+        return self._settings.ramp_step * abs(scaling.Y / scaling.V)
+
+    def joined(self, reference: ArrayLike, restarted: bool) -> Array:
+        """Join the next samples of a reference to a wanted motion [m]."""
+        raw = np.asarray(reference, dtype=np.float64)
+        if raw.ndim != 1 or not raw.size:
+            raise DataError('a block of a reference is a vector of at least one number')
+        if restarted:
+            self._join = _Join(self._join.last, self._step())
+        self._raw = np.append(self._raw, raw)[-self._preview :]
+        return self._join.process(raw)
+
+    def drive(self, wanted: Array, goal: Array) -> Drive:
+        """Drive the model along a goal [m], which moves the stage along the wanted motion [m]."""
+        self._wanted = np.append(self._wanted, wanted)
+        if self.follower is not None:
+            goal = self.follower.process(goal, self._preview + 1)
+        driven = self.inverse.process(goal)
+        v = self._guard.process(driven.v).voltage
+        now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
+        return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
+
+    def measured(self, samples: Samples) -> None:
+        """Take a block of displacement [m], on the clock of the voltage."""
+        if self.follower is not None:
+            self.follower.measured(samples)
+
+    def play(self, v: Array) -> tuple[Array, Array]:
+        """Send a given voltage, joined softly and limited; return its time and voltage."""
+        v = self._guard.process(v).voltage
+        return self._sent(v), v
+
+    def idle(self, n: int, longest: float) -> tuple[Array, Array]:
+        """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
+        v = self._guard.idle(n, longest)
+        return self._sent(v), v
+
+    def hurry(self) -> None:
+        """Begin a ramp to rest anew, so that `idle` can shorten it."""
+        self._guard = Guard(self._settings, self._guard.applied)
+
+    def _sent(self, v: Array) -> Array:
+        t = np.arange(self.tick, self.tick + v.size) / self._settings.sample_rate
+        if v.size:
+            with self._lock:
+                self._past.add(t, v)
+            if self.follower is not None:
+                self.follower.drove(t, v)
+        return t
+
+    # another model
+
+    def successor(self, model: StageModel, past: History) -> Successor:
+        """Bring a model into the state after a `past`; any thread may call this."""
+        inverse, run = self._built(model), None
+        if past:
+            period = 1.0 / self._settings.sample_rate
+            _, v = past.recall(inverse, model, period)
+            inverse.follow(v, past.count - v.size)
+            if self._follow != 'off':
+                run = inverse.model.stream()
+                run.process(*past.recall(run, inverse.model, period)[::-1])
+        return Successor(inverse, past.count, run)
+
+    def past(self) -> History:
+        """Return a snapshot of the voltage so far; any thread may call this."""
+        with self._lock:
+            return self._past.snapshot()
+
+    def take_over(self, successor: Successor) -> None:
+        """Go on with another model, from the position that it predicts."""
+        self.inverse = successor.inverse
+        if not self.tick:
+            self.reset()
+            return
+        run = successor.run
+        if self.tick > successor.count:
+            v = self._past.since(successor.count)
+            self.inverse.follow(v, successor.count)
+            if run is not None:
+                t = np.arange(successor.count, self.tick) / self._settings.sample_rate
+                run.process(v, t)
+        self.follower = self._new_follower(run)
+        # the voltage is moving, so the joined motion must move from its first sample
+        self._join = _Join(self.inverse.position, self._step(), moves=True)
+        self._wanted = self._join.process(self._raw)
+        self.inverse.process(self._wanted)
+
+
+class _Join:
+    """
+    Joins a reference along a raised cosine.
+
+    Parameters
+    ----------
+    start : float
+        Position of the stage [m].
+    step : float
+        Largest change by the cosine from one sample to the next [m].
+    moves : bool, optional
+        Whether the stage already moves along the reference.  The distance between them then fades
+        out.  From rest the reference fades in instead, so the sum never leaves the range of both.
+
+    Attributes
+    ----------
+    last : float
+        The last sample [m].
+    """
+
+    def __init__(self, start: float, step: float, moves: bool = False) -> None:
+        self.last = self._start = start
+        # no sample of the reference is known yet
+        self._command = math.nan
+        self._step, self._moves = step, moves
+        self._length, self._done = -1, 0
+        self._distance = 0.0
+
+    def process(self, x: Array) -> Array:
+        """Join the next samples; a sample that is NaN or infinite repeats the last sample."""
+        x = held(x, self._command)
+        self._command = float(x[-1])
+        if not math.isfinite(self._command):
+            return np.full(x.size, self.last)
+        if self._length < 0:
+            before = 2.0 * x[0] - x[1] if self._moves and x.size > 1 else x[0]
+            self._distance = self._start - float(before)
+            self._length = math.ceil(2.0 * abs(self._distance) / self._step)
+        if self._done < self._length:
+            tau = np.minimum((self._done + np.arange(x.size)) / self._length, 1.0)
+            left = 1.0 - tau + np.sin(2.0 * np.pi * tau) / (2.0 * np.pi)
+            self._done += x.size
+            x = x + (self._distance if self._moves else self._start - x) * left
+        self.last = float(x[-1])
+        return x
