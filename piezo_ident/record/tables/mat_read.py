@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-MATLAB files, read by SciPy after a process of its own has read them.
+MATLAB files, read by SciPy in a process of its own.
 
 SciPy's reader takes memory for whatever shape a damaged file announces, and some damage ends its
-process with SIGSEGV.  A child process therefore reads the file first, with a limit on its memory.
+process with SIGSEGV.  A child process therefore reads the file, with a limit on its memory, and
+sends the columns back.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 import os
 from pathlib import Path
+import pickle
 import re
 import subprocess
 import sys
-from typing import Any
+import tempfile
+from typing import Any, cast, IO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +32,11 @@ WIDTH = 32
 #: of the signal is a field beside it
 _TITLED = ('Data', 'values')
 
+#: names, columns, and names of columns by the paths to them
+Columns: TypeAlias = tuple[tuple[str, ...], dict[str, NDArray[Any]], dict[str, str]]
 
-def read_variables(
-    path: Path, wanted: str, needed: Iterable[str] | None
-) -> tuple[tuple[str, ...], dict[str, NDArray[Any]], dict[str, str]]:
+
+def read_variables(path: Path, wanted: str, needed: Iterable[str] | None) -> Columns:
     """
     Return the names of all variables of a MATLAB file of version 4 to 7, and the wanted ones.
 
@@ -43,23 +47,43 @@ def read_variables(
     ValueError for a damaged or too large file, or a wanted variable without numbers or texts.
     """
     asked = str(path), wanted, '*' if needed is None else ','.join(needed)
-    done = subprocess.run(
-        [sys.executable, '-m', __name__, *asked],
-        # the child imports from the places of this process
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors='replace',
-        check=False,
-    )
-    if done.returncode:
-        lines = done.stderr.strip().splitlines()
-        raise ValueError(lines[-1] if lines else f'SciPy ended with {done.returncode}')
-    names, variables, has_all = _read(*asked)
+    command = [sys.executable, '-m', __name__, *asked]
+    # the child imports from the places of this process
+    env = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
+    with (
+        tempfile.TemporaryFile() as errors,
+        subprocess.Popen(
+            command,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+        ) as child,
+    ):
+        result: Columns | None = None
+        # a child that fails sends nothing, or only a part
+        with suppress(EOFError, pickle.UnpicklingError):
+            result = pickle.load(cast('IO[bytes]', child.stdout))
+        if child.wait() or result is None:
+            errors.seek(0)
+            lines = errors.read().decode(errors='replace').strip().splitlines()
+            raise ValueError(lines[-1] if lines else f'SciPy ended with {child.returncode}')
+    return result
+
+
+def _read(path: str, wanted: str, asked: str) -> Columns:
+    """Read a file in the child; see `read_variables`."""
+    import scipy.io
+
+    names = [name for name, *_ in scipy.io.whosmat(path)]
+    has_all = {*asked.split(',')} <= {*names}
+    used = [name for name in names if not has_all or re.fullmatch(wanted, name)]
+    # without names SciPy would read all of them
+    read = scipy.io.loadmat(path, variable_names=used) if used else {}
     arrays: dict[str, Any] = {}
     paths: dict[str, str] = {}
-    for name, value in variables.items():
+    for name in used:
+        value = read[name]
         if has_all or name == 'segment_name':
             arrays[name] = _plain(name, value)
             continue
@@ -68,18 +92,6 @@ def read_variables(
         paths |= {p: key for (p, _), (key, _) in zip(plain, columns, strict=True) if p != key}
         arrays |= columns
     return tuple(names if has_all else arrays), arrays, paths
-
-
-def _read(path: str, wanted: str, asked: str) -> tuple[list[str], dict[str, Any], bool]:
-    """Return all names, the variables to use, and whether all that are `asked` are there."""
-    import scipy.io
-
-    names = [name for name, *_ in scipy.io.whosmat(path)]
-    has_all = {*asked.split(',')} <= {*names}
-    used = [name for name in names if not has_all or re.fullmatch(wanted, name)]
-    # without names SciPy would read all of them
-    read = scipy.io.loadmat(path, variable_names=used) if used else {}
-    return names, {name: read[name] for name in used}, has_all
 
 
 def flat(name: str, value: Any, *, titled: bool = True) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -144,7 +156,7 @@ if __name__ == '__main__':
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (UNPACKED_SIZE, most))
     try:
-        _read(*sys.argv[1:])
+        pickle.dump(_read(*sys.argv[1:]), sys.stdout.buffer, protocol=5)
     # SciPy, zlib and struct each have errors of their own for the same damage
     except Exception as error:  # noqa: BLE001
         sys.exit(' '.join(str(error).split()) or type(error).__name__)
