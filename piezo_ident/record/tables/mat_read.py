@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+import json
+import math
 import os
 from pathlib import Path
-import pickle
 import re
 import subprocess
 import sys
@@ -60,15 +61,33 @@ def read_variables(path: Path, wanted: str, needed: Iterable[str] | None) -> Col
             stderr=errors,
         ) as child,
     ):
-        result: Columns | None = None
+        result = None
         # a child that fails sends nothing, or only a part
-        with suppress(EOFError, pickle.UnpicklingError):
-            result = pickle.load(cast('IO[bytes]', child.stdout))
+        with suppress(TypeError, ValueError):
+            result = _received(cast('IO[bytes]', child.stdout))
         if child.wait() or result is None:
             errors.seek(0)
             lines = errors.read().decode(errors='replace').strip().splitlines()
             raise ValueError(lines[-1] if lines else f'SciPy ended with {child.returncode}')
     return result
+
+
+def _send(columns: Columns, to: IO[bytes]) -> None:
+    names, arrays, paths = columns
+    kinds = {name: (x.dtype.str, x.shape) for name, x in arrays.items()}
+    to.write(json.dumps([names, kinds, paths]).encode() + b'\n')
+    for x in arrays.values():
+        to.write(x.tobytes())
+
+
+def _received(source: IO[bytes]) -> Columns:
+    names, kinds, paths = json.loads(source.readline())
+    arrays = {}
+    for name, (kind, shape) in kinds.items():
+        dtype = np.dtype(kind)
+        data = source.read(dtype.itemsize * math.prod(shape))
+        arrays[name] = np.ndarray(shape, dtype, data)
+    return tuple(names), arrays, paths
 
 
 def _read(path: str, wanted: str, asked: str) -> Columns:
@@ -156,7 +175,7 @@ if __name__ == '__main__':
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (UNPACKED_SIZE, most))
     try:
-        pickle.dump(_read(*sys.argv[1:]), sys.stdout.buffer, protocol=5)
+        _send(_read(*sys.argv[1:]), sys.stdout.buffer)
     # SciPy, zlib and struct each have errors of their own for the same damage
     except Exception as error:  # noqa: BLE001
         sys.exit(' '.join(str(error).split()) or type(error).__name__)
