@@ -16,15 +16,14 @@ the channels ``v_<name>`` and ``y_<name>``.  Code for one axis takes them for fu
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 import re
 
 import numpy as np
 from piezo_ident.common.arrays import Array, frozen_array
-from piezo_ident.common.errors import DataError, naming
+from piezo_ident.common.errors import DataError
 from piezo_ident.record.options import plain_unit, UNITS
-from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.record import Piece
 
 #: topic with the voltage that the amplifier of the first axis applied
 APPLIED = 'applied_voltage'
@@ -156,37 +155,3 @@ class Axes:
             frozen_array(np.column_stack([columns[k] for k in names[role]])) for role in 'vy'
         )
         return cls(inputs, outputs, names['v'], names['y'], piece.sample_rate)
-
-    @classmethod
-    def of_records(cls, records: Iterable[Record]) -> list[Axes]:
-        """
-        Return the axes of every piece of some records of one stage.
-
-        Raises
-        ------
-        DataError
-            If the pieces do not carry the same axes, or are not sampled alike.
-        """
-        found: list[Axes] = []
-        for record in records:
-            for piece in record:
-                with naming(record.name):
-                    axes = cls.of(piece)
-                found.append(axes)
-                first = found[0]
-                if axes._names != first._names:
-                    own, others = ', '.join(axes._names), ', '.join(first._names)
-                    raise DataError(
-                        f'{record.name}: has {own}, and another record or piece {others}; give '
-                        'records of the same axes'
-                    )
-                if abs(axes.sample_rate / first.sample_rate - 1.0) > 1e-9:
-                    raise DataError(
-                        f'{record.name}: sampled at {axes.sample_rate:g} Hz, and another record '
-                        f'or piece at {first.sample_rate:g} Hz; give records of one rate'
-                    )
-        return found
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return (*self.input_names, *self.output_names)
