@@ -18,7 +18,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.live.block_clock import BlockClock
+from piezo_ident.live.sample_clock import BlockClock
 from piezo_ident.record.blocks import RAMPED, Samples
 from piezo_ident.record.channels import channel_of_quantity
 from piezo_ident.record.join import APPLIED, MAX_MISSING, record_of_streams

@@ -20,9 +20,8 @@ from piezo_ident.common.arrays import Array, Integers, line_between
 from piezo_ident.common.errors import DataError
 from piezo_ident.fitting.adaptation import Adaptation, Learns, Recalled
 from piezo_ident.fitting.attribution import Attribution, percent_change, SURE
-from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.predictor import BRIDGE
-from piezo_ident.live.sample_clock import Kind
+from piezo_ident.live.sample_clock import BlockClock, Kind
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples

@@ -1,21 +1,34 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Learn a repeated motion on a running stage: voltage, measurement and next voltage."""
+"""
+Learn a repeated motion on a running stage.
+
+`LiveLearning` plans a repetition, takes its measurement, and plans the next one.  `Learner` plays
+the repetitions in real time.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
+import threading
+import time
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.control.learning import Learning
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.pacing import Pace, SLIP
+from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.blocks import Samples
+from piezo_ident.record.blocks import BLOCK_SIZE, Samples
 
 #: wait at the first voltage before a repetition begins [s]
 SETTLE = 0.05
+#: longest wait for the next displacement after a repetition was sent in full [s]
+PATIENCE = 2.0
 
 
 class LiveLearning:
@@ -88,3 +101,129 @@ class LiveLearning:
         """Learn from the measured displacement, and plan the next repetition."""
         self._learning.take(self._measured)
         self.again()
+
+
+class Learner:
+    """
+    Plays the repetitions that a `LiveLearning` plans.
+
+    Parameters
+    ----------
+    make : callable
+        Returns the `LiveLearning`; a thread calls it.
+    most : int
+        Most repetitions.
+    play : callable
+        Gets time, voltage, segment and wanted displacement of the next samples.
+
+    Attributes
+    ----------
+    learning : LiveLearning or None
+        None until it is made.
+    text : str
+        Progress, for people.
+    is_over : bool
+    """
+
+    def __init__(
+        self, make: Callable[[], LiveLearning], most: int, play: Callable[[Samples, Samples], None]
+    ) -> None:
+        self.learning: LiveLearning | None = None
+        self.text, self.is_over = 'inverts the reference', False
+        self._most, self._play = most, play
+        self._count, self._sent, self._tick = 0, 0, 0
+        # set during a repetition
+        self._pace: Pace | None = None
+        self._resting = 0.0
+        self._failure = ''
+        self._thread = self._started(lambda: setattr(self, 'learning', make()))
+
+    def _started(self, work: Callable[[], None]) -> threading.Thread:
+        def safely() -> None:
+            try:
+                work()
+            except PiezoIdentError as error:
+                self._failure = str(error)
+            # the node has to report any failure of this thread
+            except Exception as error:  # noqa: BLE001
+                self._failure = f'{type(error).__name__}: {error}'
+
+        thread = threading.Thread(target=safely, name='learn', daemon=True)
+        thread.start()
+        return thread
+
+    @property
+    def progress(self) -> float:
+        """Share of the repetitions that was played [%]."""
+        return 100.0 * self._count / self._most
+
+    def measured(self, samples: Samples) -> None:
+        """Take a block of displacement."""
+        if self.learning is not None and self._pace:
+            self.learning.measured(samples, self._tick)
+            # the wait for a slow stage begins anew with each of its answers
+            self._resting = time.monotonic()
+
+    def step(self, tracker: Tracker) -> None:
+        """
+        Send the due samples, and learn between two repetitions.
+
+        Raises
+        ------
+        ConfigError
+            When learning failed, or displacement is missing.
+        """
+        if self._thread.is_alive():
+            return
+        if self._failure or self.learning is None:
+            raise ConfigError(self._failure)
+        learning, now = self.learning, time.monotonic()
+        if self._pace is None:
+            if self._count:
+                self._judge(learning)
+            if not self.is_over:
+                self._pace = Pace(tracker.settings.sample_rate, SLIP)
+                self._sent, self._tick = 0, tracker.tick
+                self._resting = 0.0
+                done = ', '.join(f'{e:.3g}' for e in learning.errors[-5:])
+                self.text = f'repetition {self._count + 1}' + (f' after {done} %' if done else '')
+        elif self._sent < learning.voltage.size:
+            self._send(tracker, learning, self._pace.due())
+            self._resting = now
+        elif learning.is_complete and tracker.is_at_rest:
+            self._count += 1
+            self._pace = None
+            self._thread = self._started(learning.take)
+        elif tracker.is_at_rest and now - self._resting > PATIENCE:
+            raise ConfigError(
+                f'the displacement of repetition {self._count + 1} did not come in full; is '
+                'there a stage, and did it lose blocks?'
+            )
+
+    @property
+    def is_played(self) -> bool:
+        """Whether a repetition was sent in full, so that the stage has to go to rest."""
+        learning = self.learning
+        return bool(self._pace and learning and self._sent >= learning.voltage.size)
+
+    def _judge(self, learning: LiveLearning) -> None:
+        errors = learning.errors
+        if learning.is_done or self._count >= self._most:
+            self.is_over = True
+            first = len(errors) - self._count
+            self.text = (
+                f'{min(errors):.3g} % of stroke after {len(errors)} repetitions, '
+                f'{errors[first]:.3g} % in the first'
+            )
+
+    def _send(self, tracker: Tracker, learning: LiveLearning, due: int) -> None:
+        due = min(self._sent + due, learning.voltage.size)
+        segment = f'learn:{len(learning.errors) + 1}'
+        while self._sent < due:
+            cut = slice(self._sent, min(due, self._sent + 10 * BLOCK_SIZE))
+            t, v = tracker.play(learning.voltage[cut])
+            wanted = learning.wanted[cut]
+            known = np.isfinite(wanted)
+            goal = Samples(t[known], wanted[known], segment, 'reference')
+            self._play(Samples(t, v, segment), goal)
+            self._sent = cut.stop

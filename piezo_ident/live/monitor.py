@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
-from piezo_ident.live.block_clock import BlockClock
-from piezo_ident.live.sample_clock import Kind
+from piezo_ident.live.sample_clock import BlockClock, Kind
 from piezo_ident.model.metrics import percent
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.readings.faults import MAX_WILD

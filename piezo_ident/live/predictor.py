@@ -4,6 +4,7 @@
 """
 Predict the displacement of a running stage, through gaps, restarts and new models.
 
+`AxesRun` runs a model; `Predictor` meets what a stream may bring.
 `piezo_ident.live.history` brings a new model into the state that it would have if it had run from
 the start.
 """
@@ -13,14 +14,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.common.arrays import line_between
+from piezo_ident.common.arrays import Array, line_between
 from piezo_ident.common.errors import ModelError
-from piezo_ident.live.axes_run import AxesRun, channels_of, check_axes
-from piezo_ident.live.block_clock import BlockClock
 from piezo_ident.live.history import History, TurningPoints
-from piezo_ident.live.sample_clock import Kind
-from piezo_ident.model.multi_axis import models_of, MultiAxisModel
+from piezo_ident.live.sample_clock import BlockClock, Kind
+from piezo_ident.model.multi_axis import alone, models_of, MOTION, motion_of, MultiAxisModel
 from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -39,6 +37,81 @@ REST = 0.01
 LEVEL = 0.9
 
 
+class AxesRun:
+    """
+    Run of a model, with a row of voltages and of displacements for each axis.
+
+    A coupled axis runs twice: alone, which gives the motion that other axes feel, and with the
+    motions of the others.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    axes : sequence of str
+        Order of the rows, by the names of the displacements; all axes of the model.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> one = pi.SimulatedStage.load('paper').model
+    >>> run = AxesRun(pi.MultiAxisModel({'y': one, 'y_b': one}), ('y', 'y_b'))
+    >>> y = run.process(np.ones((2, 300)), np.arange(300) / 20e3)
+    >>> y.shape, bool((y[0] == y[1]).all())
+    ((2, 300), True)
+    """
+
+    def __init__(self, model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
+        whole = {axis: models_of(model)[axis] for axis in axes}
+        single = alone(model)
+        self._alone = {axis: single[axis].stream() for axis in axes}
+        self._coupled = {
+            axis: x.stream() for axis, x in whole.items() if x.effects != single[axis].effects
+        }
+
+    def recall(self, pasts: Sequence[History], period: float) -> None:
+        """Come into the state after the voltages so far; `pasts` has one history a row."""
+        t, rows = np.empty(0), []
+        for axis, past in zip(self._alone, pasts, strict=True):
+            for run in filter(None, (self._coupled.get(axis), self._alone[axis])):
+                t, v = past.recall(run, run.model, period)
+            rows.append(v)
+        self.process(np.stack(rows), t)
+
+    def process(self, v: Array, t: Array) -> Array:
+        """Compute the displacements [m] of the next voltages [V], shapes (k, n); t is in s."""
+        y = [run.process(row, t) for run, row in zip(self._alone.values(), v, strict=True)]
+        if not self._coupled:
+            return y[0][np.newaxis] if len(y) == 1 else np.stack(y)
+        moved = {motion_of(axis): row for axis, row in zip(self._alone, y, strict=True)}
+        return np.stack(
+            [
+                self._coupled[axis].process(v[k], t, moved) if axis in self._coupled else y[k]
+                for k, axis in enumerate(self._alone)
+            ]
+        )
+
+
+def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
+    """Refuse a model of other axes than those of a node with a ModelError."""
+    held = models_of(model)
+    if set(held) != set(axes):
+        raise ModelError(
+            f'the model holds for {", ".join(held)}, and this node for {", ".join(axes)}: start '
+            "the node with the parameter 'axes' of the stage"
+        )
+
+
+def channels_of(model: StageModel | MultiAxisModel) -> list[tuple[str, str]]:
+    """List the effects that need a measured channel, each with the channel."""
+    several = isinstance(model, MultiAxisModel)
+    return [
+        (effect.name, effect.channel)
+        for x in models_of(model).values()
+        for effect in x.effects
+        if effect.channel and not (several and effect.channel.startswith(MOTION))
+    ]
+
+
 class Predictor:
     """
     Predicts the displacement as blocks of voltage come.
@@ -47,6 +120,8 @@ class Predictor:
     ----------
     axes : sequence of str, optional
         Names of the displacements; blocks of several axes have a row for each.
+    level : float, optional
+        Share of the errors that the band holds.
 
     Attributes
     ----------
@@ -54,11 +129,6 @@ class Predictor:
         The last problem of the stream; empty without one.
     half_width : Samples or None
         Half width of the band of the last block [m]; None if the model carries no band.
-
-    Parameters
-    ----------
-    level : float, optional
-        Share of the errors that the band holds.
     """
 
     def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:
@@ -207,9 +277,7 @@ class Predictor:
         )
         return Samples(t, y, samples.segment, 'displacement')
 
-    def _half_width(
-        self, v: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _half_width(self, v: Array, y: Array) -> Array | None:
         models = [] if self.model is None else _with_band(self.model)
         if len(models) < len(self._axes):
             return None
@@ -218,7 +286,7 @@ class Predictor:
             self._bands = [BandStream(x, self._level, plays=known, creep=False) for x in models]
         return np.stack([band.follow(*of) for band, *of in zip(self._bands, v, y, strict=True)])
 
-    def _usable(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> bool:
+    def _usable(self, t: Array, v: Array) -> bool:
         if problem := time_problem(t):
             self.problem = f'a block of voltage is left out: {problem}'
         elif not np.isfinite(v).all():
@@ -236,7 +304,7 @@ class Predictor:
             return True
         return False
 
-    def _bridge(self, t0: float, t1: float, v1: NDArray[np.float64], missing: int) -> None:
+    def _bridge(self, t0: float, t1: float, v1: Array, missing: int) -> None:
         self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'
         if missing * self._clock.period > BRIDGE:
             self._clear()
@@ -247,9 +315,7 @@ class Predictor:
         self._advance(line_between(t0, t1, missing), between)
         self._lowest = [float('inf')] * len(self._axes)
 
-    def _advance(
-        self, t: NDArray[np.float64], v: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _advance(self, t: Array, v: Array) -> Array | None:
         self._remember(t, v)
         model = self.model
         if model is None:
@@ -263,7 +329,7 @@ class Predictor:
             self._run = AxesRun(model, self._axes)
         return self._run.process(v, t)
 
-    def _remember(self, t: NDArray[np.float64], v: NDArray[np.float64]) -> None:
+    def _remember(self, t: Array, v: Array) -> None:
         for k, past in enumerate(self._pasts):
             self._lowest[k] = min(self._lowest[k], float(v[k].min()))
             past.add(t, v[k])

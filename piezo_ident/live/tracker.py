@@ -21,11 +21,11 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.control.inputs import FAR
 from piezo_ident.control.live_inverse import PREVIEW
 from piezo_ident.effects import find_effect
-from piezo_ident.live.axes_run import check_axes
 from piezo_ident.live.axis_drive import AxisDrive, Drive, Successor
 from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.history import History
+from piezo_ident.live.predictor import check_axes
 from piezo_ident.model.multi_axis import alone, models_of, MOTION, motion_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block

@@ -53,8 +53,7 @@ class DrivingNode(LabNode):
         self._faults = RecentFaults()
         self._counts = self._faults.counts
         self._begin_ramp()
-        # the topic of an axis ends with the tail of the axis
-        self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
+        self._tails = self.tails()
         self._outputs = [ExclusivePublisher(self, f'voltage{tail}') for tail in self._tails]
         self._timer = self.create_timer(PERIOD, self._on_timer, autostart=False)
         self.offer('stop', self._stop)

@@ -114,7 +114,7 @@ class ExcitationNode(LabNode):
         self._second = ''
         self._rate = Rate()
         super().__init__(**kwargs)
-        self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
+        self._tails = self.tails()
         self._build(self.values['program'])
         # loads the kernel, so that a ramp to rest need not wait for it
         Guard(self._guard_settings())

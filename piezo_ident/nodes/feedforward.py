@@ -48,7 +48,7 @@ from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.live.axis_drive import Drive, Successor
 from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
-from piezo_ident.live.live_learning import LiveLearning
+from piezo_ident.live.live_learning import Learner, LiveLearning
 from piezo_ident.live.pacing import Looks, Rate
 from piezo_ident.live.reference import Reference, TrackingErrors
 from piezo_ident.live.sample_clock import Kind, SampleClock
@@ -57,7 +57,6 @@ from piezo_ident.model.multi_axis import models_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
-from piezo_ident.nodes.learner import Learner
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
 from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples

@@ -86,6 +86,10 @@ class LabNode(ParameterNode):
         """Create a timer on the steady clock of the machine, independent of ROS time."""
         return super().create_timer(*args, **{'clock': self._steady, **kwargs})
 
+    def tails(self) -> list[str]:
+        """Return the end of the topics of each axis: none of the first one, ``_b`` of axis b."""
+        return ['', *(f'_{name}' for name in self.values['axes'] if name)]
+
     # status, diagnostics, services
 
     def report_status(

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.fitting.adaptation import Recalled
-from piezo_ident.live.axes_run import AxesRun
 from piezo_ident.live.comparison import AxisComparison, finite_readings
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.join import Join
 from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
-from piezo_ident.live.predictor import Predictor, warm_up
+from piezo_ident.live.predictor import AxesRun, Predictor, warm_up
 from piezo_ident.model.multi_axis import alone, models_of
 from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
@@ -47,8 +46,7 @@ class ModelNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         warm_up()
-        # the topic of an axis ends with the tail of the axis
-        self._tails = ['', *(f'_{name}' for name in self.values['axes'] if name)]
+        self._tails = self.tails()
         self._refuse_adaptation(self.values)
         axes = [f'y{tail}' for tail in self._tails]
         self._predictor = Predictor(axes, self.values['interval'])
@@ -181,8 +179,6 @@ class ModelNode(LabNode):
         self._not_finite += samples.not_finite
         if what == 'displacement':
             self._displacement(tail, samples)
-        elif not self._tails[1:]:
-            self._voltage(samples)
         else:
             self._join.add(tail, samples, time.monotonic())
             self._take_complete()

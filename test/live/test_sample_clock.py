@@ -6,8 +6,7 @@
 import math
 
 import numpy as np
-from piezo_ident.live.block_clock import BlockClock
-from piezo_ident.live.sample_clock import Kind, SampleClock
+from piezo_ident.live.sample_clock import BlockClock, Kind, SampleClock
 from piezo_ident.record.blocks import Samples
 import pytest
 
