@@ -80,6 +80,25 @@ def _rate() -> Declaration:
     )
 
 
+def _volts(name: str, default: float, text: str) -> Declaration:
+    return Declaration(name, default, text, 'V', -1000.0, 1000.0)
+
+
+def _limits(how: str) -> tuple[Declaration, Declaration]:
+    low, high = (f'{which} voltage that is ever {how}' for which in ('lowest', 'highest'))
+    return _volts('voltage_low', 0.0, low), _volts('voltage_high', 10.0, high)
+
+
+def _listeners(when: str) -> tuple[Declaration, Declaration]:
+    return (
+        Declaration('subscribers', 1, f'how many must {when}', '1', 0, 100),
+        Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    )
+
+
+_MODEL = Declaration('model', '', 'model file to start with; empty: wait for the topic')
+
+
 def _axes(what: str) -> Declaration:
     return Declaration(
         'axes',
@@ -107,14 +126,10 @@ EXCITATION = (
     Declaration(
         'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0
     ),
-    Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
-    Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),
-    Declaration('rest', 0.0, 'voltage to which a stop ramps', 'V', -1000.0, 1000.0),
+    *_limits('sent'),
+    _volts('rest', 0.0, 'voltage to which a stop ramps'),
     Declaration('ramp_slew', 20.0, 'top speed of the ramp of a stop', 'V/s', 0.001, 1e6),
-    Declaration(
-        'subscribers', 1, 'how many must listen to voltage before the first block', '1', 0, 100
-    ),
-    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    *_listeners('listen to voltage before the first block'),
 )
 
 STAGE = (
@@ -128,12 +143,9 @@ STAGE = (
         2**31 - 1,
         read_only=True,
     ),
-    Declaration('voltage_low', 0.0, 'lowest voltage that is ever applied', 'V', -1000.0, 1000.0),
-    Declaration(
-        'voltage_high', 10.0, 'highest voltage that is ever applied', 'V', -1000.0, 1000.0
-    ),
+    *_limits('applied'),
     Declaration('slew', 40000.0, 'steepest voltage that is ever applied', 'V/s', 1.0, 1e9),
-    Declaration('rest', 0.0, 'voltage to which a silent drive is ramped', 'V', -1000.0, 1000.0),
+    _volts('rest', 0.0, 'voltage to which a silent drive is ramped'),
     Declaration(
         'ramp_slew', 20.0, 'speed of the ramps to rest and into a new stream', 'V/s', 0.001, 1e6
     ),
@@ -196,7 +208,7 @@ IDENTIFIER = (
 )
 
 MODEL = (
-    Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    _MODEL,
     _axes('which are predicted too, from voltage_<name>'),
     Declaration(
         'warn_ratio',
@@ -290,14 +302,13 @@ PLAYER = (
         'topics to replay; a recorded model would overwrite the live one',
     ),
     _axes('whose topics are replayed too'),
-    Declaration('subscribers', 1, 'how many must listen before the first message', '1', 0, 100),
-    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    *_listeners('listen before the first message'),
     Declaration('autostart', False, 'start to replay at once', read_only=True),
 )
 
 FEEDFORWARD = (
     _rate(),
-    Declaration('model', '', 'model file to start with; empty: wait for the topic'),
+    _MODEL,
     _axes('each with a reference_<name> that voltage_<name> follows'),
     Declaration(
         'preview',
@@ -308,12 +319,9 @@ FEEDFORWARD = (
         10.0,
         read_only=True,
     ),
-    Declaration('voltage_low', 0.0, 'lowest voltage that is ever sent', 'V', -1000.0, 1000.0),
-    Declaration('voltage_high', 10.0, 'highest voltage that is ever sent', 'V', -1000.0, 1000.0),
+    *_limits('sent'),
     Declaration('slew', 40000.0, 'steepest voltage that is ever sent', 'V/s', 1.0, 1e9),
-    Declaration(
-        'rest', 0.0, 'voltage before a reference, and to which a stop ramps', 'V', -1000.0, 1000.0
-    ),
+    _volts('rest', 0.0, 'voltage before a reference, and to which a stop ramps'),
     Declaration(
         'ramp_slew', 20.0, 'top speed of the ramps to rest and into a reference', 'V/s', 0.001, 1e6
     ),
@@ -327,10 +335,7 @@ FEEDFORWARD = (
     Declaration(
         'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0
     ),
-    Declaration(
-        'subscribers', 1, 'how many must listen to voltage before the first block', '1', 0, 100
-    ),
-    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    *_listeners('listen to voltage before the first block'),
     Declaration('window', 2.0, 'time over which the tracking error is taken', 's', 0.1, 600.0),
     Declaration('repetitions', 8, 'most repetitions of one ~/learn', '1', 1, 100),
     Declaration('longest', 60.0, 'longest reference that is kept for ~/learn', 's', 0.1, 3600.0),

@@ -78,37 +78,49 @@ _SHARES = {
 
 
 @dataclass(frozen=True, eq=False)
-class IdentificationOutcome:
+class Outcome:
     """
-    Result of an identification, or of one of its steps.
+    Result of a job, as the node publishes it.
 
     Attributes
     ----------
-    message : str
-        One line for people.
-    brief : str
-        The message in few words, a number first.
+    message, brief : str
+        One line for people, and the same in few words, a number first.
     figures : mapping of str to str
         Numbers of the message.
-    report : str
-        JSON.
+    report, model : str
+        JSON, and the new model as YAML; empty without one.
     warnings : int
-        Number of warnings in the report.
-    steps : Steps or None
-        Results of the steps so far.
-    identification : Identification, EachAxis of Identification, or None
-    model : str
-        YAML; empty without a model.
+        Number of warnings, and of faults of the data, in the report.
     """
 
-    message: str
+    message: str = ''
     brief: str = ''
     figures: Mapping[str, str] = field(default_factory=dict)
     report: str = ''
+    model: str = ''
     warnings: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class IdentificationOutcome(Outcome):
+    """Result of an identification, or of one of its steps, with the results of `steps` so far."""
+
     steps: Steps | None = None
     identification: Identification | EachAxis[Identification] | None = None
-    model: str = ''
+
+
+@dataclass(frozen=True, eq=False)
+class DiagnosisOutcome(Outcome):
+    """
+    Result of a diagnosis; the `diagnosis` is None if the capture lacks motion.
+
+    `given` is the given model as YAML, `wanted` an experiment that would decide an open question.
+    """
+
+    diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
+    given: str = ''
+    wanted: Experiment | None = None
 
 
 def with_warnings(text: str, count: int) -> str:
@@ -266,37 +278,6 @@ def _sentence(steps: Steps) -> str:
     return '' if delay is None else f'delay: {delay.samples} samples ({delay.source})'
 
 
-@dataclass(frozen=True, eq=False)
-class DiagnosisOutcome:
-    """
-    Result of a diagnosis.
-
-    Attributes
-    ----------
-    diagnosis : Diagnosis, EachAxis of Diagnosis, or None
-        None if the capture lacks motion.
-    message, brief, report, model, given : str
-        Verdict as a sentence, and in few words; diagnosis as JSON; refined and given model as
-        YAML.
-    figures : mapping of str to str
-        Numbers of the sentence.
-    warnings : int
-        Number of warnings and faults of the data in the report.
-    wanted : Experiment or None
-        Experiment that would decide an open question.
-    """
-
-    diagnosis: Diagnosis | EachAxis[Diagnosis] | None
-    message: str = ''
-    brief: str = ''
-    figures: Mapping[str, str] = field(default_factory=dict)
-    report: str = ''
-    model: str = ''
-    given: str = ''
-    warnings: int = 0
-    wanted: Experiment | None = None
-
-
 def diagnose_capture(
     snapshot: Snapshot,
     given: StageModel | MultiAxisModel,
@@ -321,7 +302,7 @@ def diagnose_capture(
     record = snapshot.record('capture')
     records = [r for r in records_of_runs(record) if _is_driven(given, r)]
     if not records:
-        return DiagnosisOutcome(None, wanted=next_experiment(None, asked=asked))
+        return DiagnosisOutcome(wanted=next_experiment(None, asked=asked))
     result = diagnose(given, records, settings, progress=tick)
     # every run is a record of its own, so a restart of the clock is harmless
     faults = tuple(fault for fault in record.faults if fault.name != 'restart')
@@ -330,7 +311,7 @@ def diagnose_capture(
     each = [*_each(result).values()]
     wishes = (next_experiment(x, records, asked) for x in each)
     return DiagnosisOutcome(
-        result,
+        diagnosis=result,
         message=_joined(result, lambda x: x.sentence),
         brief=_joined(result, _brief),
         figures=_figures(result, _verdict_of),

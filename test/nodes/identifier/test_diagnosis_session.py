@@ -83,7 +83,11 @@ def lab():
 def outcome_of(verdict, wanted=None):
     found = example(verdict)
     return DiagnosisOutcome(
-        found, found.sentence, json_text(found), model_to_yaml(found.model), wanted=wanted
+        found.sentence,
+        report=json_text(found),
+        model=model_to_yaml(found.model),
+        diagnosis=found,
+        wanted=wanted,
     )
 
 
