@@ -27,8 +27,8 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError, printable
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.given import begin, ParameterNode, unknown_to
 from piezo_ident.nodes.journal import FromPackage, shortened, shown
+from piezo_ident.nodes.parameter_node import begin, ParameterNode, unknown_to
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
 import rclpy

@@ -21,9 +21,9 @@ from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
 from piezo_ident.live.predictor import AxesRun, Predictor, warm_up
 from piezo_ident.model.multi_axis import alone, models_of
-from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
+from piezo_ident.nodes.parameter_node import home_problem
 from piezo_ident.nodes.wire import from_message, PREVIEW, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState

@@ -26,8 +26,8 @@ from typing import Any
 import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import Rate
-from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
+from piezo_ident.nodes.parameter_node import home_problem
 from piezo_ident.nodes.parameters import with_axes
 from piezo_ident.nodes.subscriptions import RawSubscriptions, topics_problem
 from piezo_ident.record.bags.write import BagWriter

@@ -19,7 +19,6 @@ from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
 from piezo_ident.model.multi_axis import each_of, EachAxis, load
-from piezo_ident.nodes.given import home_problem
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs
@@ -35,6 +34,7 @@ from piezo_ident.nodes.identifier.jobs import (
 )
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
+from piezo_ident.nodes.parameter_node import home_problem
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.subscriptions import topics_problem
 from piezo_ident.nodes.wire import LATCHED
