@@ -33,20 +33,11 @@ MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
 
 def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -> None:
     """
-    Refuse a record that lost too much of a segment that the three steps need.
+    Refuse a record that lost too much of a segment that the three steps need, with a DataError.
 
-    Time missing between two pieces counts for the segments on both sides.
-
-    Parameters
-    ----------
-    record : Record
-    sent : mapping of str to float, optional
-        Time [s] of each kind of segment in the voltage, which reveals samples that are missing at
-        either end of the record.
-
-    Raises
-    ------
-    DataError
+    Time missing between two pieces counts for the segments on both sides.  The time `sent` [s] of
+    each kind of segment in the voltage reveals samples that are missing at either end of the
+    record.
     """
     present = {kind: sum(p.duration for p in record.find(kind)) for kind in NEEDED}
     missing = dict.fromkeys(NEEDED, 0.0)
@@ -165,14 +156,7 @@ class Snapshot:
     faults: tuple[Fault, ...] = ()
 
     def record(self, name: str = 'capture') -> Record:
-        """
-        Make the record.
-
-        Raises
-        ------
-        DataError
-            If voltage or displacement are missing, or could only be used by guessing.
-        """
+        """Make the record; DataError if voltage or displacement are missing, or need a guess."""
         for key, cure in (
             ('voltage', 'start the excitation, or replay a bag'),
             ('displacement', 'is the stage running, and does it publish on this topic?'),
@@ -222,16 +206,10 @@ class Capture:
 
     def add(self, key: str, samples: Samples, arrival: int) -> None:
         """
-        Take a block.
+        Take a block that came at a time `arrival` [ns] of a clock that all topics share.
 
-        Parameters
-        ----------
-        key : str
-            ``voltage``, ``displacement``, ``applied_voltage``, the same with ``_<name>`` behind it
-            for a further axis, or ``x_<name>``.
-        samples : Samples
-        arrival : int
-            When it came [ns], by a clock that all topics share.
+        The `key` is ``voltage``, ``displacement``, ``applied_voltage``, the same with ``_<name>``
+        behind it for a further axis, or ``x_<name>``.
         """
         topic = self._topics.setdefault(key, _Topic())
         topic.add(samples, arrival)
@@ -260,14 +238,7 @@ class Capture:
         return topic.seconds(min(topic.stream.n, topic.total - mark.get(key, 0)))
 
     def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
-        """
-        Copy the capture up to now, at little cost.
-
-        Parameters
-        ----------
-        since : mapping of str to int, optional
-            A mark; the copy begins there.  See `mark`.
-        """
+        """Copy the capture at little cost, from the mark `since` on; see `mark`."""
         faults = [
             Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
             for key, (count, reason) in self._unreadable.items()

@@ -31,14 +31,11 @@ class AxisComparison:
     window : float
         Time over which the live errors are taken [s].
     corrector : Corrector
-    publish : callable
-        Gets the name of a quantity, ``residual`` or ``estimate``, and a block of it.
-    tell : callable
-        Gets the corrections of the estimate, by their names.
+    publish, tell, note : callable
+        Get the name of a quantity, ``residual`` or ``estimate``, and a block of it; the
+        corrections of the estimate by their names; a doubt about the readings as text.
     knows : callable
         Says whether the run of the model knows the memory of its plays.
-    note : callable
-        Gets a doubt about the readings, as text.
 
     Attributes
     ----------

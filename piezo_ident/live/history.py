@@ -109,15 +109,10 @@ class TurningPoints:
 
     def path(self, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """
-        Return time [s] and voltage [V] of a path through the turning points.
+        Return time [s] and voltage [V], every `period` [s], of a path through the turning points.
 
         Operators that depend on the speed need it.  The path holds the recorded samples before
         each point, connected by short straight lines.
-
-        Parameters
-        ----------
-        period : float
-            Sampling period [s].
         """
         parts_t: list[NDArray[np.float64]] = []
         parts_v: list[NDArray[np.float64]] = []
@@ -178,19 +173,9 @@ class History:
         self, run: Recalling, model: StageModel, period: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """
-        Set a fresh run by the old part of the voltage; return the recent part.
+        Set a fresh run by the old part of the voltage, and return the recent part.
 
-        Parameters
-        ----------
-        run : Recalling
-        model : StageModel
-        period : float
-            Sampling period [s].
-
-        Returns
-        -------
-        t, v : ndarray, shape (n,)
-            Time [s] and voltage [V] of the recent part, which the caller has to run through.
+        The caller has to run through the recent part: time [s] and voltage [V], every `period` [s].
         """
         # without an old part the recent part is the whole run
         if len(self._old):

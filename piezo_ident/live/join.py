@@ -137,12 +137,8 @@ class Join:
         """
         Yield the blocks of the first axis whose partners have come, each with its note.
 
-        Parameters
-        ----------
-        is_over : callable
-            Says whether the wait of a block that came at a time [s] is over.
-        silent : collection of str
-            Axes for which no block waits: no node publishes their topics.
+        `is_over` says whether the wait of a block that came at a time [s] is over.  No block waits
+        for a `silent` axis: no node publishes its topics.
         """
         while self._waiting:
             samples, note, since = self._waiting[0]

@@ -33,29 +33,14 @@ PATIENCE = 2.0
 
 class LiveLearning:
     """
-    Repetitions of one reference.
-
-    Parameters
-    ----------
-    model : StageModel
-    reference : ndarray, shape (n,)
-        [m]
-    settings : GuardSettings
-        At the rate of the model.
+    Plans the repetitions of one reference [m]; DataError when the reference is out of reach.
 
     Attributes
     ----------
-    model : StageModel
-    reference : ndarray
     voltage : ndarray, shape (m,)
         Voltage of the next repetition [V].  The guard makes the ramp from rest to its first value.
     wanted : ndarray, shape (m,)
         Wanted displacement at the same samples [m]; NaN before the motion.
-
-    Raises
-    ------
-    DataError
-        When the reference is out of reach.
     """
 
     def __init__(self, model: StageModel, reference: Array, settings: GuardSettings) -> None:
@@ -105,16 +90,10 @@ class LiveLearning:
 
 class Learner:
     """
-    Plays the repetitions that a `LiveLearning` plans.
+    Plays the repetitions that a `LiveLearning` plans, at `most` so many.
 
-    Parameters
-    ----------
-    make : callable
-        Returns the `LiveLearning`; a thread calls it.
-    most : int
-        Most repetitions.
-    play : callable
-        Gets time, voltage, segment and wanted displacement of the next samples.
+    A thread calls `make` for the plan.  `play` gets a block of voltage and one of wanted
+    displacement.
 
     Attributes
     ----------
@@ -168,10 +147,7 @@ class Learner:
         """
         Send the due samples, and learn between two repetitions.
 
-        Raises
-        ------
-        ConfigError
-            When learning failed, or displacement is missing.
+        ConfigError when learning failed, or displacement is missing.
         """
         if self._thread.is_alive():
             return

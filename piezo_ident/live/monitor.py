@@ -214,18 +214,11 @@ class TrackingError:
     """
     Wanted minus measured displacement, block by block.
 
-    Parameters
-    ----------
-    window : float
-        Time over which the rms is taken [s].
-
-    Attributes
-    ----------
-    live : LiveError
+    `live` takes the rms over a time `window` [s]; `quantity` is the name of the errors.
     """
 
-    def __init__(self, window: float) -> None:
-        self._matcher, self.live = Matcher(), LiveError(window)
+    def __init__(self, window: float, quantity: str = 'tracking_error') -> None:
+        self._matcher, self.live, self._quantity = Matcher(), LiveError(window), quantity
         self._low, self._high = np.inf, -np.inf
 
     def wanted(self, samples: Samples) -> list[Samples]:
@@ -254,7 +247,7 @@ class TrackingError:
         errors = []
         for pair in pairs:
             e = pair.y_hat - pair.y
-            errors.append(Samples(pair.t, e, pair.segment, 'tracking_error'))
+            errors.append(Samples(pair.t, e, pair.segment, self._quantity))
             self.live.add(pair.t, e, self._high - self._low, pair.y)
         return errors
 

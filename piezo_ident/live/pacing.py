@@ -71,16 +71,10 @@ class Schedule:
 
 class Pace:
     """
-    Number of samples due in real time since the last look.
+    Counts the samples due in real time since the last look.
 
-    After a long pause of the process the stream goes on where it was.
-
-    Parameters
-    ----------
-    rate : float
-        Samples a second.
-    longest : float
-        Longest time that one look makes up [s].
+    The stream has `rate` samples a second.  A look makes up for the `longest` time [s] at most:
+    after a long pause of the process the stream goes on where it was.
     """
 
     def __init__(self, rate: float, longest: float) -> None:
@@ -119,17 +113,9 @@ class ArrivalClock:
     Times of arrival that go on evenly when somebody sets the clock of the machine.
 
     A bag is read in the order of its log times.  Times from a clock that was set back would
-    interleave later messages with earlier messages.
-
-    Parameters
-    ----------
-    wall, steady : callable, optional
-        The clock that stamps arrivals and may be set, and a clock that cannot be set [ns].
-
-    Attributes
-    ----------
-    set_by : int
-        Time by which the clock was set since the beginning [ns].
+    interleave later messages with earlier messages.  `wall` stamps arrivals and may be set,
+    `steady` cannot be set [ns].  `set_by` is the time by which the clock was set since the
+    beginning [ns].
     """
 
     def __init__(

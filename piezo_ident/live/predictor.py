@@ -184,11 +184,8 @@ class Predictor:
         """
         Take a model, in the state that it would have if it had run from the start.
 
-        Raises
-        ------
-        ModelError
-            When its axes or its sampling rate are not those of the stream, or when one of its
-            effects needs a further channel.
+        ModelError when its axes or its sampling rate are not those of the stream, or when one of
+        its effects needs a further channel.
         """
         check_axes(model, self._axes)
         for name, channel in channels_of(model):
@@ -229,7 +226,7 @@ class Predictor:
 
     def process(self, samples: Samples) -> Samples | None:
         """
-        Predict the displacement for a block.
+        Predict the displacement [m] for a block of voltage [V], shape (n,), or (k, n) for k axes.
 
         The result is None if the block is left out, or if the model is missing or has another
         rate.
@@ -237,11 +234,6 @@ class Predictor:
         A straight line bridges a gap of up to half a second.  A longer gap and a restart begin a
         new run, with the stage at rest.  Repeated and late blocks, and blocks with NaN or infinite
         numbers, are left out.
-
-        Parameters
-        ----------
-        samples : Samples
-            Voltage [V], shape (n,), or (k, n) for k axes; the prediction has the same shape.
         """
         # copies, since the message may change
         t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64, ndmin=2)

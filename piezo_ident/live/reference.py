@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -22,19 +21,8 @@ class Reference:
     """
     Reference of all axes, as one stream.
 
-    Parameters
-    ----------
-    tails : sequence of str
-        Ends of the topics of all axes, the first one empty.
-    sample_rate : float
-        [Hz]
-
-    Attributes
-    ----------
-    join : Join
-        The blocks that wait.
-    length : int
-        Samples of the last stream.
+    `tails` are the ends of the topics of all axes, the first one empty.  `join` holds the blocks
+    that wait, and `length` is the number of samples of the last stream.
     """
 
     def __init__(self, tails: Sequence[str], sample_rate: float) -> None:
@@ -55,18 +43,10 @@ class Reference:
         self, samples: Samples, verdict: Verdict, resting: Collection[str], longest: float
     ) -> tuple[Array, list[tuple[str, str, int]]]:
         """
-        Make the next block whole.
+        Make the next block whole; return it with its faults.
 
-        Parameters
-        ----------
-        samples : Samples
-            Of the first axis.
-        verdict : Verdict
-            Of the clock, on a block that it takes.
-        resting : collection of str
-            Further axes that nobody wants to move.
-        longest : float
-            Length up to which the stream is kept [s].
+        The `verdict` is that of the clock on this block, which is one of the first axis.  Nobody
+        wants to move the `resting` axes.  The stream is kept up to the length `longest` [s].
 
         Returns
         -------
@@ -122,21 +102,12 @@ class TrackingErrors:
     """
     Wanted minus measured displacement of each axis.
 
-    Parameters
-    ----------
-    tails : sequence of str
-        Ends of the topics of all axes, the first one empty.
-    window : float
-        Time over which the rms is taken [s].
-
-    Attributes
-    ----------
-    percents : dict of str to float
-        Rms of the error of each axis at the last `look` [% of the span of the wanted motion].
+    `tails` are the ends of the topics of all axes.  The rms is taken over a time `window` [s].
+    `percents` holds the rms of each axis at the last `look` [% of the span of the wanted motion].
     """
 
     def __init__(self, tails: Sequence[str], window: float) -> None:
-        self._each = {tail: TrackingError(window) for tail in tails}
+        self._each = {tail: TrackingError(window, f'tracking_error{tail}') for tail in tails}
         self.percents: dict[str, float] = {}
 
     def set_window(self, window: float) -> None:
@@ -152,15 +123,14 @@ class TrackingErrors:
     def wanted(self, t: Array, rows: Array, segment: str) -> list[Samples]:
         """Take the wanted motion of all axes, a row each; return the errors that it completes."""
         return [
-            replace(error, quantity=f'tracking_error{tail}')
-            for (tail, one), row in zip(self._each.items(), np.atleast_2d(rows), strict=True)
+            error
+            for one, row in zip(self._each.values(), np.atleast_2d(rows), strict=True)
             for error in one.wanted(Samples(t, row, segment, 'reference'))
         ]
 
     def measured(self, tail: str, samples: Samples) -> list[Samples]:
         """Take the displacement of an axis; return the errors that it completes."""
-        errors = self._each[tail].measured(samples)
-        return [replace(error, quantity=f'tracking_error{tail}') for error in errors]
+        return self._each[tail].measured(samples)
 
     def is_waiting(self, tail: str) -> bool:
         """Tell whether wanted motion of an axis still waits for its displacement."""

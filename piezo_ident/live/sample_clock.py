@@ -303,20 +303,11 @@ class BlockClock:
 
     def judge(self, t: NDArray[np.float64]) -> tuple[Kind, int]:
         """
-        Take note of the next block.
+        Take note of the next block, by the time stamps [s] of its samples, shape (n,).
 
-        Parameters
-        ----------
-        t : ndarray, shape (n,)
-            Time stamps [s] of consecutive samples.
-
-        Returns
-        -------
-        Kind
-            `Kind.START`, `Kind.NEXT`, `Kind.GAP` or `Kind.LATE`.
-        int
-            Samples missing before the block (`Kind.GAP`), or samples at its beginning that came
-            before (`Kind.LATE`).
+        Returns `Kind.START`, `Kind.NEXT`, `Kind.GAP` or `Kind.LATE`, and the number of samples
+        that are missing before the block (`Kind.GAP`), or that came before, at its beginning
+        (`Kind.LATE`).
         """
         first, last, before = float(t[0]), float(t[-1]), self.last
         if last > first:

@@ -57,14 +57,7 @@ NARROW = 0.5
 
 
 def read_program(text: str) -> Program:
-    """
-    Read the program that a parameter names or contains.
-
-    Raises
-    ------
-    ConfigError
-        When the program does not exist or has a fault.
-    """
+    """Read the program that a parameter names or contains; ConfigError if it has a fault."""
     if '\n' in text or ('segments' in text and ':' in text):
         return parse_program(text)
     return Program.load(text)

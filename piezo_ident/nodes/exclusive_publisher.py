@@ -78,10 +78,7 @@ class ExclusivePublisher:
         """
         Ask for the right to drive, in the executor of the node; `poll` says when it is granted.
 
-        Raises
-        ------
-        ConfigError
-            When another publisher exists, with `stays`.
+        ConfigError when another publisher exists, with `stays`.
         """
         # a node without a known name yet may have the own name
         self._refuse(name for name in self.others() if name != UNNAMED)
@@ -96,10 +93,7 @@ class ExclusivePublisher:
         """
         Return whether blocks may be sent; any thread may call this.
 
-        Raises
-        ------
-        ConfigError
-            When another publisher drives, or too few listen within the limit [s].
+        ConfigError when another publisher drives, or too few listen within the `limit` [s].
         """
         now = time.monotonic()
         self.refuse_foreign_blocks()
@@ -126,15 +120,11 @@ class ExclusivePublisher:
 
     def refuse_foreign_blocks(self) -> None:
         """
-        Look for blocks of another publisher; the thread that sends calls this.
+        Refuse to go on when another publisher has sent a block, with a ConfigError.
 
-        The search lasts until `TOGETHER` after the right to drive was granted.  Two nodes that ask
-        for it at the same moment hear each other only when both send.
-
-        Raises
-        ------
-        ConfigError
-            When another publisher has sent a block.
+        The thread that sends calls this.  The search lasts until `TOGETHER` after the right to
+        drive was granted: two nodes that ask for it at the same moment hear each other only when
+        both send.
         """
         with self._lock:
             listener = self._listener

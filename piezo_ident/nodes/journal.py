@@ -34,14 +34,7 @@ _NUMBER = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?')
 
 
 class RecentFaults:
-    """
-    Faults of a stream: their counts, and the last message of each fault for some seconds.
-
-    Attributes
-    ----------
-    counts : Counter
-        Number of occurrences by fault.
-    """
+    """Faults of a stream: their `counts`, and the last message of each fault for some seconds."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -90,15 +83,7 @@ class Journal:
         self._patterns: dict[str, float] = {}
 
     def tell(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
-        """
-        Write a single event.
-
-        Parameters
-        ----------
-        text : str
-        level : bytes, optional
-            As in diagnostic_msgs/DiagnosticStatus.
-        """
+        """Write a single event, of a level as in diagnostic_msgs/DiagnosticStatus."""
         line = one_line(text)
         with self._lock:
             lines = _fresh(self._lines)

@@ -104,20 +104,12 @@ class LabNode(ParameterNode):
         **values: object,
     ) -> None:
         """
-        Publish the latched status.
+        Publish the latched status: a `state` in one word, its progress [%] and a text for people.
 
         The text is the last value.  The message begins with a figure and fits ``ros2 topic echo``.
 
         Parameters
         ----------
-        state : str
-            One word.
-        progress : float
-            Percent.
-        text : str
-            For people.
-        level : bytes, optional
-            As in diagnostic_msgs/DiagnosticStatus.
         brief : str, optional
             The text in few words, a number first; default: the progress and the text.
         problems : str, optional
@@ -173,14 +165,9 @@ class LabNode(ParameterNode):
 
     def offer(self, name: str, handler: Callable[[], str]) -> None:
         """
-        Offer a Trigger service.
+        Offer a Trigger service ``~/name``.
 
-        Parameters
-        ----------
-        name : str
-            Without the ``~/``.
-        handler : callable
-            Starts the work and returns the answer; raises `PiezoIdentError` to refuse.
+        The handler starts the work and returns the answer; it raises `PiezoIdentError` to refuse.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -239,16 +226,8 @@ def run(make: Callable[[], LabNode]) -> int:
     """
     Run a node until SIGINT or SIGTERM, and close it before the context ends.
 
-    Parameters
-    ----------
-    make : callable
-        Makes the node.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node could
-        not start.
+    Returns the exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node
+    could not start.
     """
     # another thread, for example reading YAML, must not delay the executor for long
     sys.setswitchinterval(SWITCH)

@@ -63,13 +63,7 @@ class ModelLoader(Generic[T]):
         node.create_subscription(String, 'model', self._load_text, LATCHED)
 
     def begin_with(self, path: str) -> None:
-        """
-        Load a file at once, at the start of a node; a bad file ends the node.
-
-        Raises
-        ------
-        PiezoIdentError
-        """
+        """Load a file at once, at the start of a node; PiezoIdentError if it is bad."""
         try:
             with naming(path):
                 self._take(self._prepare(load(path)), path)

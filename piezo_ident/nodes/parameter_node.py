@@ -40,10 +40,7 @@ def begin() -> None:
     """
     Initialise ROS, without its signal handlers.
 
-    Raises
-    ------
-    ConfigError
-        When ROS cannot take the arguments, or a file that they name.
+    ConfigError when ROS cannot take the arguments, or a file that they name.
     """
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)

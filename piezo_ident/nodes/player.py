@@ -96,10 +96,7 @@ class PlayerNode(LabNode):
         """
         Replay the bag from its beginning; see ``~/status``.
 
-        Raises
-        ------
-        PiezoIdentError
-            When the bag is missing, or a replay runs already.
+        PiezoIdentError when the bag is missing, or a replay runs already.
         """
         bag = self.values['bag']
         if not bag:
@@ -117,14 +114,7 @@ class PlayerNode(LabNode):
         return f'replaying {bag}; see ~/status'
 
     def stop(self) -> str:
-        """
-        End the replay.
-
-        Raises
-        ------
-        PiezoIdentError
-            When no replay runs.
-        """
+        """End the replay; PiezoIdentError when none runs."""
         if self._replay is None or not self._is_replaying():
             raise PiezoIdentError('not replaying; call start first')
         self._replay.stop.set()
@@ -216,14 +206,7 @@ class PlayerNode(LabNode):
         return senders
 
     def _await_subscribers(self, replay: Replay, senders: Mapping[str, Any]) -> None:
-        """
-        Wait until enough listen to every topic.
-
-        Raises
-        ------
-        PiezoIdentError
-            When too few come within `wait_limit`.
-        """
+        """Wait for `subscribers` on every topic; PiezoIdentError after `wait_limit`."""
         need, limit = self.values['subscribers'], self.values['wait_limit']
         began = time.monotonic()
         while True:
@@ -310,30 +293,13 @@ def chosen_topics(
     bag: Bag, wanted: Sequence[str], resolve: Callable[[str], str]
 ) -> dict[str, str]:
     """
-    Choose topics of a bag, and the name under which each is replayed.
+    Choose topics of an open bag; return their full names here by their names in the bag.
 
-    A topic is found by its full name here.  Otherwise it is found by the end of its name, so that
-    a recording of one namespace can be replayed in another.  Otherwise it is found by the quantity
-    that its blocks carry.
+    A `wanted` topic is found by its full name here, which `resolve` gives by namespace and
+    remaps.  Otherwise it is found by the end of its name, so that a recording of one namespace can
+    be replayed in another.  Otherwise it is found by the quantity that its blocks carry.
 
-    Parameters
-    ----------
-    bag : Bag
-        An open bag.
-    wanted : sequence of str
-        Names of topics, relative or absolute.
-    resolve : callable
-        Gives the full name of a topic, by namespace and remaps.
-
-    Returns
-    -------
-    dict of str to str
-        Full name here by the name in the bag.
-
-    Raises
-    ------
-    DataError
-        When a topic is not in the bag, or more than one could be meant.
+    DataError when a topic is not in the bag, or more than one could be meant.
     """
     topics = sorted({c.topic for c in bag.connections})
     chosen: dict[str, str] = {}

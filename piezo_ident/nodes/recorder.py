@@ -91,10 +91,7 @@ class RecorderNode(LabNode):
         """
         Open a bag and record; ``~/status`` says when all publishers are matched.
 
-        Raises
-        ------
-        PiezoIdentError
-            When a recording runs already.
+        PiezoIdentError when a recording runs already.
         """
         if self._is_recording():
             raise PiezoIdentError('recording already; call stop, and wait until it is done')
@@ -110,14 +107,7 @@ class RecorderNode(LabNode):
         return f'recording to {recording.output}; see ~/status'
 
     def stop(self) -> str:
-        """
-        End the recording and close the bag.
-
-        Raises
-        ------
-        PiezoIdentError
-            When nothing is being recorded.
-        """
+        """End the recording and close the bag; PiezoIdentError when nothing is being recorded."""
         recording = self._recording
         if recording is None or not self._is_recording():
             raise PiezoIdentError('not recording; call start first')

@@ -51,13 +51,8 @@ def between_turns(node: Node, work: Callable[[], None]) -> None:
     """
     Call a function between two turns of the executor of a node; any thread may call this.
 
-    Destroying an entity while the executor gathers its wait set breaks the executor.
-
-    Parameters
-    ----------
-    node : Node
-    work : callable
-        Called at once if the node has no executor.
+    Destroying an entity while the executor gathers its wait set breaks the executor.  Without an
+    executor the function is called at once.
     """
     if node.executor is None:
         work()
@@ -69,10 +64,7 @@ def message_class(name: str) -> Any:
     """
     Import the class of a message type like ``std_msgs/msg/String``.
 
-    Raises
-    ------
-    PiezoIdentError
-        When the package of the type is not installed.
+    PiezoIdentError when the package of the type is not installed.
     """
     package, _, kind = name.partition('/msg/')
     try:

@@ -65,11 +65,9 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     All nodes call this function, so all refuse the same messages.  Values may be NaN or infinite;
     each node documents its answer to them.
 
-    Raises
-    ------
-    DataError
-        When the layout is not that of a block, contradicts the data, or exceeds the largest block.
-        Also when the quantity is wrong, or the time stamps are not those of consecutive samples.
+    DataError when the layout is not that of a block, contradicts the data, or exceeds the largest
+    block.  Also when the quantity is wrong, or the time stamps are not those of consecutive
+    samples.
     """
     dims, n = message.layout.dim, len(message.data)
     if n > 2 * MOST:

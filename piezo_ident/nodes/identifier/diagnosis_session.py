@@ -44,19 +44,7 @@ class DiagnosisSession:
     """
     Diagnoses a model until no question is open or no request is left.
 
-    Each diagnosis begins with the identified model.
-
-    Parameters
-    ----------
-    host : Host
-    capture : Capture
-
-    Attributes
-    ----------
-    given : StageModel, MultiAxisModel or None
-        The model that is diagnosed.
-    diagnosis : Diagnosis, EachAxis of Diagnosis, or None
-        Last diagnosis of this model.
+    Each diagnosis begins with the `given` model; `diagnosis` is the last one of this model.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
@@ -71,11 +59,7 @@ class DiagnosisSession:
         """
         Take another model to diagnose.
 
-        Parameters
-        ----------
-        model : StageModel or MultiAxisModel
-        used : mapping
-            From `Capture.mark`: the capture up to this mark served to identify the model.
+        `used` is the `Capture.mark` up to which the capture served to identify the model.
         """
         self.given, self.diagnosis, self._used = model, None, used
 
@@ -99,10 +83,7 @@ class DiagnosisSession:
         """
         Begin; return a message about the first step.
 
-        Raises
-        ------
-        PiezoIdentError
-            When the model is missing, or data and excitation are both missing.
+        PiezoIdentError when the model is missing, or data and excitation are both missing.
         """
         self.drop()
         if self.given is None:

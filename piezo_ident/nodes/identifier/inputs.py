@@ -27,17 +27,7 @@ class Inputs:
     """
     Streams of a capture.
 
-    Parameters
-    ----------
-    node : Node
-    capture : Capture
-    channels : sequence of str
-        Topics of further axes and channels.
-
-    Attributes
-    ----------
-    passed : Counter
-        Number of samples that came on each topic.
+    `channels` are topics of further axes and channels; `passed` counts the samples on each topic.
     """
 
     def __init__(self, node: Node, capture: Capture, channels: Sequence[str]) -> None:

@@ -134,10 +134,7 @@ def settings_of(values: dict[str, object]) -> Settings:
     """
     Make the settings of an identification from the parameters of the node.
 
-    Raises
-    ------
-    ConfigError
-        When a value is out of range.
+    ConfigError when a value is out of range.
     """
     swarm = values['solver'] == 'swarm'
     delay = int(str(values['delay']))
@@ -177,18 +174,9 @@ def identify_capture(
     """
     Make a record of a capture and identify it.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-    settings : Settings
-    which : {'all', 'delay', 'dynamics', 'hysteresis'}
-    steps : Steps or None
-        Results of earlier steps; for single steps only.
-    before : StageModel, MultiAxisModel or None
-        Earlier model of this stage.
-    axes : sequence of str
-        Names of further axes.
-    tick : callable
+    `which` names a step, or is ``all``.  `steps` are the results of earlier steps, for single
+    steps only; `before` is an earlier model of this stage, and `axes` are the names of further
+    axes.
     """
     tick('record', 0.0)
     record = snapshot.record('capture')
@@ -288,15 +276,8 @@ def diagnose_capture(
     """
     Make records of a capture and diagnose a model by them.
 
-    Parameters
-    ----------
-    snapshot : Snapshot
-        Capture without the samples that the model was identified from.
-    given : StageModel or MultiAxisModel
-    asked : tuple of {'sweeps', 'holds'}
-        Experiments that the excitation has played already.
-    settings : DiagnosisSettings
-    tick : callable
+    The `snapshot` is without the samples that the model was identified from.  The excitation has
+    played the experiments `asked` already.
     """
     tick('record', 0.0)
     record = snapshot.record('capture')

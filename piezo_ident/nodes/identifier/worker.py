@@ -21,12 +21,8 @@ class Worker:
     """
     Runs one job at a time without delaying the caller.
 
-    Parameters
-    ----------
-    nice : int, optional
-        Niceness of the process: a larger one leaves more time to other processes.
-    warm_up : callable, optional
-        Function of a module that the process calls first.
+    A larger niceness `nice` leaves more time to other processes.  The process calls `warm_up`
+    first, a function of a module.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
@@ -49,14 +45,8 @@ class Worker:
         """
         Start a job; see `piezo_ident.common.process.WorkerProcess.run`.
 
-        Parameters
-        ----------
-        job : callable
-        progress : callable
-            Called with the step and its share done, at most every `EVERY`, in another thread.
-        ended : callable
-            Called with the result and None, or in case of an error with None and the error, in
-            another thread.
+        Another thread calls `progress` with the step and its share done, at most every `EVERY`.
+        It calls `ended` with the result and None, or in case of an error with None and the error.
         """
         if self.is_busy:
             raise PiezoIdentError('another job runs; wait for its end or cancel it')
