@@ -175,7 +175,7 @@ class History:
         """
         Set a fresh run by the old part of the voltage, and return the recent part.
 
-        The caller has to run through the recent part: time [s] and voltage [V], every `period` [s].
+        The caller has to run through the recent part: time [s] and voltage [V].
         """
         # without an old part the recent part is the whole run
         if len(self._old):
