@@ -15,12 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.explain import groups
-from piezo_ident.axes.frequency_response import excited_lines, frequency_response
-from piezo_ident.axes.linear_fit import refined
-from piezo_ident.axes.modal import Modal
-from piezo_ident.axes.periodic import PeriodicRecord
 from piezo_ident.common.arrays import Array
+from piezo_ident.fitting.modes.frequency_response import excited_lines, frequency_response
+from piezo_ident.fitting.modes.linear_fit import refined
+from piezo_ident.fitting.modes.periods import groups, PeriodicRecord
+from piezo_ident.model.modes.modal import Modal
 
 #: modes nearer than this part of their frequency trade places from fit to fit: neither is followed
 APART = 0.02

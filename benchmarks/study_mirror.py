@@ -13,7 +13,7 @@ holds {u,y}_..mV_test.npy besides, they are judged as well.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -27,12 +27,16 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from amplitude_dependence import amplitude_dependence, AmplitudeDependence
 from matplotlib.figure import Figure
 import numpy as np
-from piezo_ident.axes.explain import explain, Explanation, groups, Rival, Score, scores
-from piezo_ident.axes.linear_fit import choose_order
-from piezo_ident.axes.loop_fit import loop_fit
-from piezo_ident.axes.loop_model import LoopModel
-from piezo_ident.axes.periodic import Periodicity, periodicity, PeriodicRecord
+import piezo_ident as pi
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ModelError
+from piezo_ident.fitting.modes.frequency_response import frequency_response
+from piezo_ident.fitting.modes.linear_fit import choose_order, refined
+from piezo_ident.fitting.modes.loop_fit import loop_fit
+from piezo_ident.fitting.modes.periods import differences, groups, PeriodicRecord, weighted
+from piezo_ident.model.modes.modal import Modal
+from piezo_ident.model.modes.shared_modes import SharedModes
+from piezo_ident.record.record import Piece, Segment
 from piezo_ident.report.figures import style
 
 RATE = 6400.0
@@ -40,22 +44,16 @@ AMPLITUDES = (100, 200, 300)
 #: realisations, from zero, that no fit sees
 HELD_OUT = (4, 5)
 ORDERS = (28, 36, 44, 52)
-#: time constants of the level in samples that are tried besides that of the model
-MEMORIES = (5.0, 30.0)
+VOLTAGES, DISPLACEMENTS = ('v', 'v_b', 'v_c'), ('y', 'y_b', 'y_c')
 #: published on the test part, pooled, one model for all amplitudes
 PUBLISHED = {
     'published, linear': (18.6, 6.6, 16.3),
     'published, nonlinear (28 states and a neural network)': (6.37, 4.84, 4.19),
 }
-
-NAMES = {
-    'linear': 'one linear model',
-    'changed_dynamics': 'changed dynamics: a linear model for each amplitude',
-    'input_hysteresis': 'input hysteresis: plays of the voltages',
-    'loop_hysteresis': 'loop hysteresis: plays of the extension, inside the loop',
-    'softening': 'softening by the level of the extension, inside the loop',
-    'hysteretic_stiffness': '**hysteretic stiffness**: softening and plays inside the loop',
-}
+LINEAR, EACH = 'one linear model', 'a linear model for each amplitude'
+CHAINS, LOOP = 'chains, as `identify` finds them', '**shared modes with loop hysteresis**'
+#: steady answer to one period of voltages in a group of records
+Answer = Callable[[Array, str], Array]
 
 TEXT = """\
 # A measured fast steering mirror
@@ -70,21 +68,27 @@ part of this project. Orthogonal multisines of random phase up to 3 kHz drive al
 once, at 100, 200 and 300 mV rms. Each amplitude has six realisations of 8192 samples at 6.4 kHz,
 two periods in steady state.
 
-**Held out**: realisations {held_out} (from zero) at each amplitude. They decide which effect is
-named. The form of the candidates was found with their errors in view; the test part of the
-benchmark, which is not used here, is the one clean judge.
+**Held out**: realisations {held_out} (from zero) at each amplitude; no fit and no decision uses
+them. The form of the laws was found with their errors in view; the test part of the benchmark,
+which is not used here, is the one clean judge.
 
 ## What a linear model lacks
 
-{found}
+    found = pi.identify(records)
+    settings = pi.DiagnosisSettings(effects=('loop_hysteresis',))
+    diagnosis = pi.diagnose(found.model, records, settings)
 
-| one model for all amplitudes | 100 mV | 200 mV | 300 mV | mean of outputs and realisations | s |
-|---|---|---|---|---|---|
+The verdict on axis `y`:
+
+{sentence}
+
+| one model for all amplitudes | 100 mV | 200 mV | 300 mV |
+|---|---|---|---|
 {rows}
 
 The error is 100 rms(y - y_hat) / rms(y) in free run over the second period, pooled over all
-outputs and realisations held out. The fifth column is the mean over outputs and realisations, for
-100 / 200 / 300 mV. The published rows are pooled over all outputs of the test part.
+outputs and realisations held out. The published rows are pooled over all outputs of the test part.
+`identify` took {identified:.0f} s, `diagnose` {diagnosed:.0f} s.
 
 ![Spectra of the motion and of the errors](images/mirror_residual.png)
 
@@ -97,8 +101,7 @@ rms in bands of 25 Hz, in % of rms(y).*
     y(k)   = C x(k) + D u(k) + H p(k)
     z(k)   = F x(k) + G u(k)
 
-The linear part has {order} states; the order was chosen by error in free run ({orders}).
-Nine signals z act back on the mechanics as voltages would:
+The linear part has {order} states. Nine signals z act back on the mechanics as voltages would:
 
 - three **soften** the stage: p = z (s - 1), where s is the rms of the three, followed with a time
   constant of {memory:.0f} samples ({memory_ms:.0f} ms); they begin as the extension of the
@@ -112,13 +115,6 @@ and not its cause: a joint that slips would look alike.
 
 The model is stable at each level between {low:.2f} and {high:.2f}, the plays at rest; beyond them
 the softening stays.
-
-The time constant tells whether the stiffness follows the instant or the level. The softening
-alone, refitted with other time constants:
-
-| time constant / samples | 100 mV | 200 mV | 300 mV |
-|---|---|---|---|
-{memories}
 
 ## How the modes depend on the amplitude
 
@@ -143,8 +139,8 @@ All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods.
 ## What is left
 
 Noise is {noise} % of rms(y) in one period at 100 / 200 / 300 mV. The rest of the error repeats
-from period to period and grows nearly in proportion to the amplitude. No candidate of this page
-lowers it below 400 Hz and above 3 kHz.
+from period to period and grows nearly in proportion to the amplitude. No law of this page lowers
+it below 400 Hz and above 3 kHz.
 """
 
 
@@ -166,33 +162,64 @@ def load(folder: Path, part: str) -> list[PeriodicRecord]:
             PeriodicRecord(f'{amplitude} mV, realisation {i}', f'{amplitude} mV', RATE, u[i], y[i])
             for i in range(len(u))
         ]
+    return weighted(found)
+
+
+def as_record(periods: PeriodicRecord) -> pi.Record:
+    """Make a record of the package of one realisation."""
+    u, y = (x.reshape(-1, x.shape[2]) for x in (periods.u, periods.y))
+    columns = dict(zip((*VOLTAGES, *DISPLACEMENTS), (*u.T, *y.T), strict=True))
+    v, d = columns.pop('v'), columns.pop('y')
+    number = periods.name.rpartition(' ')[2]
+    segment = Segment(f'multisine:{periods.group}-{number}', 0, len(v))
+    return pi.Record((Piece(v, d, RATE, 0.0, (segment,), columns),), periods.name)
+
+
+def of_model(model: pi.MultiAxisModel) -> Answer:
+    """Answer by a model of the front door."""
+
+    def steady(u: Array, group: str) -> Array:
+        v = dict(zip(VOLTAGES, np.vstack([u, u]).T, strict=True))
+        y = model.simulate(v)
+        return np.column_stack([y[a] for a in DISPLACEMENTS])[len(u) :]
+
+    return steady
+
+
+def of_groups(models: Mapping[str, SharedModes]) -> Answer:
+    """Answer by a model of each group."""
+    return lambda u, group: models[group].steady(u)
+
+
+def errors(answer: Answer, records: Sequence[PeriodicRecord]) -> dict[str, float]:
+    """Compute 100 rms(y - y_hat) / rms(y) of each group; infinite for a model that runs away."""
+    found = {}
+    for group, members in groups(records).items():
+        try:
+            left = [r.error(answer(r.u[-1], group)) for r in members]
+        except ModelError:
+            found[group] = float('inf')
+            continue
+        power = sum(float(np.sum(r.y[-1] ** 2)) for r in members)
+        found[group] = 100 * float(np.sqrt(sum(np.nansum(e**2) for e in left) / power))
     return found
 
 
-def cells(found: dict[str, Score]) -> str:
-    pooled = ' | '.join(f'{s.pooled:.2f}' for s in found.values())
-    return f'{pooled} | {" / ".join(f"{s.mean:.2f}" for s in found.values())}'
-
-
-def table(explanation: Explanation) -> str:
+def table(found: Mapping[str, Mapping[str, float]]) -> str:
     """Return the rows of all models."""
-    rows = [
-        f'| {name} | {" | ".join(f"{e:.2f}" for e in errors)} | | |'
-        for name, errors in PUBLISHED.items()
-    ]
+    rows = [f'| {name} | {" | ".join(f"{e:.2f}" for e in x)} |' for name, x in PUBLISHED.items()]
     rows += [
-        f'| {NAMES[c.name]} | {cells(c.scores)} | {c.seconds:.0f} |'
-        for c in explanation.candidates
+        f'| {name} | {" | ".join(f"{e:.2f}" for e in x.values())} |' for name, x in found.items()
     ]
     return '\n'.join(rows)
 
 
-def spectra(records: Sequence[PeriodicRecord], candidate: Rival | None) -> Array:
+def spectra(records: Sequence[PeriodicRecord], answer: Answer | None) -> Array:
     """Return the power of the errors, or of the motion, by line, as a share of that of y."""
     total, power = 0.0, 0.0
     for record in records:
         y = record.y[-1]
-        error = y if candidate is None else candidate.models[record.group].error(record)
+        error = y if answer is None else record.error(answer(record.u[-1], record.group))
         total = total + (np.abs(np.fft.rfft(error, axis=0)) ** 2).sum(axis=1)
         power += float((np.abs(np.fft.rfft(y, axis=0)) ** 2).sum())
     return np.asarray(total / power)
@@ -210,25 +237,6 @@ def in_bands(power: Array, edges: Array) -> Array:
     return 100 * np.sqrt(sums)
 
 
-def all_spectra(
-    held_out: Sequence[PeriodicRecord], explanation: Explanation
-) -> dict[str, list[Array]]:
-    """Return spectra by what they are of, one a group."""
-    parts = groups(held_out)
-    candidates = {
-        'motion': None,
-        'one linear model': explanation['linear'],
-        'linear for each amplitude': explanation['changed_dynamics'],
-        'hysteretic stiffness': explanation['hysteretic_stiffness'],
-    }
-    found = {
-        name: [spectra(part, candidate) for part in parts.values()]
-        for name, candidate in candidates.items()
-    }
-    found['noise'] = [noise_spectra(part) for part in parts.values()]
-    return found
-
-
 def residual_picture(found: dict[str, list[Array]], names: Sequence[str]) -> Figure:
     """Draw the spectra at each amplitude."""
     fig = style.figure(6.2)
@@ -236,8 +244,8 @@ def residual_picture(found: dict[str, list[Array]], names: Sequence[str]) -> Fig
     edges = np.arange(0.0, 3201.0, 25.0)
     colours = {
         'motion': style.BLACK,
-        'one linear model': style.VERMILION,
-        'hysteretic stiffness': style.BLUE,
+        LINEAR: style.VERMILION,
+        'shared modes': style.BLUE,
         'noise': style.GREY,
     }
     for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
@@ -279,12 +287,12 @@ def modes_picture(measured: AmplitudeDependence, model: AmplitudeDependence) -> 
     return fig
 
 
-def simulated(model: LoopModel, records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:
+def simulated(answer: Answer, records: Sequence[PeriodicRecord]) -> list[PeriodicRecord]:
     """Return the records as the model would have moved."""
     found = []
     for record in records:
         u = record.mean_u
-        y = model.simulate(u)
+        y = answer(u, record.group)
         found.append(replace(record, u=np.array([u, u]), y=np.array([y, y])))
     return found
 
@@ -304,52 +312,20 @@ def modes_rows(measured: AmplitudeDependence, model: AmplitudeDependence) -> str
     return '\n'.join(rows)
 
 
-def memory_rows(
-    explanation: Explanation,
+def linear_models(
     taught: Sequence[PeriodicRecord],
-    held_out: Sequence[PeriodicRecord],
-    weights: Sequence[float],
-) -> str:
-    """Refit the softening with other time constants."""
-    softening = explanation['softening']
-    model = next(iter(softening.models.values()))
-    few = [i for part in groups(taught).values() for i in _best_two(part, taught, weights)]
-    rows = []
-    for memory in MEMORIES:
-        fitted = loop_fit(
-            replace(model, memory=memory),
-            [taught[i] for i in few],
-            weights=[weights[i] for i in few],
-            iterations=6,
-        )
-        found = scores(dict.fromkeys(softening.models, fitted), held_out)
-        rows.append(f'| {memory:.0f} | {" | ".join(f"{s.pooled:.2f}" for s in found.values())} |')
-    errors = ' | '.join(f'{s.pooled:.2f}' for s in softening.scores.values())
-    return '\n'.join([*rows, f'| {model.memory:.0f} | {errors} |'])
-
-
-def _best_two(
-    part: Sequence[PeriodicRecord], taught: Sequence[PeriodicRecord], weights: Sequence[float]
-) -> list[int]:
-    places = [i for i, record in enumerate(taught) if any(record is member for member in part)]
-    return sorted(places, key=lambda i: -weights[i])[:2]
-
-
-def sentence(explanation: Explanation) -> str:
-    """Say what was found."""
-    best, linear = explanation[explanation.name], explanation['linear']
-
-    def pooled(candidate: Rival) -> str:
-        return ' / '.join(f'{s.pooled:.1f}' for s in candidate.scores.values())
-
-    text = (
-        f'Diagnosed: `{explanation.name}`. One model for the three amplitudes leaves '
-        f'{pooled(best)} % of the motion at 100 / 200 / 300 mV on realisations that no fit saw, '
-        f'where one linear model leaves {pooled(linear)} %, and a linear model made for each '
-        f'amplitude {pooled(explanation["changed_dynamics"])} %. Hysteresis of the inputs alone '
-        f'leaves {pooled(explanation["input_hysteresis"])} %: the effect sits inside the loop.'
-    )
-    return textwrap.fill(text, 99)
+) -> tuple[Modal, dict[str, SharedModes], dict[str, SharedModes]]:
+    """Fit the middle amplitude, one linear model to all amplitudes, and one to each."""
+    parts = groups(taught)
+    middle = parts[f'{AMPLITUDES[1]} mV']
+    start, _ = choose_order(middle[:-1], middle[-1:], orders=ORDERS)
+    one = loop_fit(SharedModes.of(start), taught, iterations=6)
+    each = {}
+    for group, members in parts.items():
+        good = [r for r in members if r.weight == 1] or members
+        response = frequency_response(good)
+        each[group] = SharedModes.of(refined(start, response, iterations=10))
+    return start, dict.fromkeys(parts, one), each
 
 
 def main() -> None:
@@ -363,65 +339,92 @@ def main() -> None:
         sys.exit(f'{folder} is not there; set PIEZO_IDENT_DATA to the folder that holds fsm')
     since = time.monotonic()
 
-    def report(text: str) -> None:
+    def report(text: str) -> float:
         print(f'{time.monotonic() - since:4.0f} s  {text}', flush=True)
+        return time.monotonic() - since
 
     records = load(folder, 'train')
-    tested = periodicity(records)
-    for item in tested:
-        if item.suspicious:
-            report(str(item))
     per_group = len(records) // len(AMPLITUDES)
     out = [i % per_group in HELD_OUT for i in range(len(records))]
     taught = [r for r, o in zip(records, out, strict=True) if not o]
     held_out = [r for r, o in zip(records, out, strict=True) if o]
-    weights = [t.weight for t, o in zip(tested, out, strict=True) if not o]
+    measured = [as_record(r) for r in taught]
+    settings = pi.DiagnosisSettings(effects=('loop_hysteresis',))
+    identified = pi.identify(measured)
+    begun = report('identified')
+    diagnosis = pi.diagnose(identified.model, measured, settings)
+    ended = report(diagnosis['y'].sentence)
+    model, modes = diagnosis.model, diagnosis.modes
+    if modes is None:
+        sys.exit('no hysteresis inside the loop of shared modes was found')
 
-    # the order is chosen by a realisation that is taught later
-    middle = groups(taught)[f'{AMPLITUDES[1]} mV']
-    linear, errors = choose_order(middle[:-1], middle[-1:], orders=ORDERS)
-    report(f'{linear.order} states: {errors}')
-    explanation = explain(linear, taught, held_out, weights=weights, report=report)
-    model = explanation.model
-    report(f'named: {explanation.name}')
-
-    memories = memory_rows(explanation, taught, held_out, weights)
-    good = [r for r, t in zip(records, tested, strict=True) if not t.suspicious]
-    measured = amplitude_dependence(linear, good)
-    of_model = amplitude_dependence(linear, simulated(model, good))
-    found = all_spectra(held_out, explanation)
+    start, one, each = linear_models(taught)
+    answers = {
+        CHAINS: of_model(identified.model),
+        LINEAR: of_groups(one),
+        EACH: of_groups(each),
+        LOOP: of_model(model),
+    }
+    found = {name: errors(answer, held_out) for name, answer in answers.items()}
+    report(table(found))
+    if (folder / f'u_{AMPLITUDES[0]}mV_test.npy').is_file():
+        report(f'test part: {errors(answers[LOOP], load(folder, "test"))}')
+    good = [r for r in records if r.weight == 1]
+    dependence = amplitude_dependence(start, good)
+    of_loop = amplitude_dependence(start, simulated(answers[LOOP], good))
     if args.pictures is not None:
+        parts = groups(held_out)
+        shown = {'motion': None, LINEAR: answers[LINEAR], 'shared modes': answers[LOOP]}
+        drawn = {k: [spectra(p, a) for p in parts.values()] for k, a in shown.items()}
+        drawn['noise'] = [noise_spectra(part) for part in parts.values()]
         for name, picture in (
-            ('residual', residual_picture(found, list(groups(held_out)))),
-            ('modes', modes_picture(measured, of_model)),
+            ('residual', residual_picture(drawn, list(parts))),
+            ('modes', modes_picture(dependence, of_loop)),
         ):
             picture.savefig(args.pictures / f'mirror_{name}.png', dpi=style.DPI)
-
-    if (folder / f'u_{AMPLITUDES[0]}mV_test.npy').is_file():
-        test = scores(dict.fromkeys(groups(records), model), load(folder, 'test'))
-        report(f'test part: {cells(test)}')
     page = {
         'minutes': (time.monotonic() - since) / 60,
         'cores': os.cpu_count(),
         'beside': beside(time.process_time() / (time.monotonic() - since)),
         'held_out': ' and '.join(map(str, HELD_OUT)),
-        'found': sentence(explanation),
-        'rows': table(explanation),
-        'order': linear.order,
-        'orders': ', '.join(f'{o}: {e:.2f} %' for o, e in errors.items()),
-        'memory': model.memory,
-        'low': model.range[0],
-        'high': model.range[1],
-        'memory_ms': 1e3 * model.memory / RATE,
-        'parameters': count(model),
-        'memories': memories,
-        'modes': modes_rows(measured, of_model),
-        'periodicity': '\n'.join(f'- {t}' for t in tested if t.suspicious),
-        'usual': usual(tested),
-        'noise': noise_by_group(tested),
+        'sentence': textwrap.fill(
+            diagnosis['y'].sentence, 99, initial_indent='> ', subsequent_indent='> '
+        ),
+        'rows': table(found),
+        'identified': begun,
+        'diagnosed': ended - begun,
+        'order': modes.linear.order,
+        'memory': modes.memory,
+        'low': modes.range[0],
+        'high': modes.range[1],
+        'memory_ms': 1e3 * modes.memory / RATE,
+        'parameters': count(modes),
+        'modes': modes_rows(dependence, of_loop),
+        **repeats(records),
     }
     args.out.write_text(TEXT.format(**page))
     report(f'wrote {args.out}')
+
+
+def repeats(records: Sequence[PeriodicRecord]) -> dict[str, object]:
+    """Say which records do not repeat, and by how much the others differ between periods."""
+    differ, weights = 100 * differences(records), np.array([r.weight for r in records])
+    odd = [
+        f'- {r.name}: {x:.1f} % between periods, far more than the others; it counts {w:.2f}'
+        for r, x, w in zip(records, differ, weights, strict=True)
+        if w < 1
+    ]
+    noise = []
+    for group in groups(records):
+        own = [r.group == group for r in records] & (weights == 1)
+        # a difference has the noise of two periods
+        noise.append(f'{np.mean(differ[own]) / np.sqrt(2):.1f}')
+    sound = differ[weights == 1]
+    return {
+        'periodicity': '\n'.join(odd),
+        'usual': (sound.min(), sound.max()),
+        'noise': ' / '.join(noise),
+    }
 
 
 def beside(share: float) -> str:
@@ -429,28 +432,12 @@ def beside(share: float) -> str:
     return ', with less than one of them for itself: other work ran beside it' if share < 1 else ''
 
 
-def count(model: LoopModel) -> int:
-    """Return how many numbers a model has, but for the coordinates of its modes."""
-    linear = model.linear
-    arrays = (linear.b, linear.c, linear.d, model.e, model.h, model.f, model.g)
+def count(modes: SharedModes) -> int:
+    """Return how many numbers the modes have, but for their coordinates."""
+    linear = modes.linear
+    arrays = (linear.b, linear.c, linear.d, modes.e, modes.h, modes.f, modes.g)
     # a mode may be turned and scaled, two numbers a block, without any change
-    return sum(a.size for a in arrays) + int((model.mu != 0).sum())
-
-
-def usual(tested: Sequence[Periodicity]) -> tuple[float, float]:
-    fine = [t.difference for t in tested if not t.suspicious]
-    return min(fine), max(fine)
-
-
-def noise_by_group(tested: Sequence[Periodicity]) -> str:
-    """Return the noise of one period at each amplitude, mean over the records that repeat."""
-    fine: dict[str, list[float]] = {}
-    for t in tested:
-        of_group = fine.setdefault(t.name.partition(',')[0], [])
-        if not t.suspicious:
-            # a difference has the noise of two periods
-            of_group.append(t.difference / np.sqrt(2))
-    return ' / '.join(f'{np.mean(found):.1f}' for found in fine.values())
+    return sum(a.size for a in arrays) + int((modes.mu != 0).sum())
 
 
 if __name__ == '__main__':

@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from piezo_ident.identification.results import Identification
     from piezo_ident.identification.settings import Settings
     from piezo_ident.live.guard import Guard, GuardSettings
+    from piezo_ident.model.axes_file import load
     from piezo_ident.model.free_run import FreeRun
-    from piezo_ident.model.multi_axis import EachAxis, load, MultiAxisModel
+    from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
     from piezo_ident.model.simulated_stage import SimulatedStage
     from piezo_ident.model.stage_model import StageModel
     from piezo_ident.model.two_axis_stage import TwoAxisStage
@@ -88,7 +89,7 @@ _HOMES = {
     'free_run': 'verbs.predict',
     'identify': 'verbs.learn',
     'invert': 'verbs.invert',
-    'load': 'model.multi_axis',
+    'load': 'model.axes_file',
     'read': 'record.io',
     'report': 'report',
     'write': 'record.io',

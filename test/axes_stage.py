@@ -6,9 +6,9 @@
 from dataclasses import replace
 
 import numpy as np
-from piezo_ident.axes.loop_model import LoopModel
-from piezo_ident.axes.modal import balanced, to_modal
-from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.fitting.modes.periods import PeriodicRecord
+from piezo_ident.model.modes.modal import balanced, to_modal
+from piezo_ident.model.modes.shared_modes import SharedModes
 from scipy.linalg import expm
 
 RATE, SAMPLES = 2000.0, 2048
@@ -47,15 +47,15 @@ def loop_stage(*, softening=0.04, plays=0.08):
     f, g = (gain @ x / size[:, None] for x in (linear.c, linear.d))
     e, h = np.hstack([linear.b] * 2), np.hstack([linear.d] * 2)
     pushes = np.concatenate([softening * size, plays * size])
-    return LoopModel(
-        linear,
-        e * pushes,
-        h * pushes,
-        np.vstack([f, f]),
-        np.vstack([g, g]),
-        2,
-        np.array([[0.0, 0.0]] * 2 + [[0.4, 0.6]] * 2),
-        np.array([0.4, 1.0]),
+    return replace(
+        SharedModes.of(linear),
+        e=e * pushes,
+        h=h * pushes,
+        f=np.vstack([f, f]),
+        g=np.vstack([g, g]),
+        levels=2,
+        mu=np.array([[0.0, 0.0]] * 2 + [[0.4, 0.6]] * 2),
+        r=np.array([0.4, 1.0]),
         memory=100.0,
     )
 
@@ -79,10 +79,21 @@ def multisine(rng, amplitude, count=2):
 
 def record(model, rng, amplitude, name='record', *, noise=0.0, periods=2):
     u = multisine(rng, amplitude)
-    y = model.simulate(u) if isinstance(model, LoopModel) else answer(model, u)
+    y = model.steady(u) if isinstance(model, SharedModes) else answer(model, u)
     y = np.array([y] * periods)
     y += noise * y.std() * rng.standard_normal(y.shape)
     return PeriodicRecord(name, f'{amplitude:g}', RATE, np.array([u] * periods), y)
+
+
+def error(model, record):
+    """Return the error of a model over the last period of a record, in steady state."""
+    return record.error(model.steady(record.u[-1]))
+
+
+def percent(model, records):
+    """Return 100 rms(y - y_hat) / rms(y) over records."""
+    errors = [np.linalg.norm(error(model, r)) / np.linalg.norm(r.y[-1]) for r in records]
+    return 100 * float(np.sqrt(np.mean(np.square(errors))))
 
 
 def answer(linear, u):

@@ -24,8 +24,9 @@ from piezo_ident.cli.identify_command import (
 from piezo_ident.common.errors import ConfigError, naming
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.effects import catalogue
+from piezo_ident.model.axes_file import load
 from piezo_ident.model.metrics import FORMULA
-from piezo_ident.model.multi_axis import EachAxis, load, mapped, models_of
+from piezo_ident.model.multi_axis import EachAxis, mapped, models_of
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.report import diagnosis_text, to_json, validated

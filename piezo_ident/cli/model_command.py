@@ -27,11 +27,11 @@ from piezo_ident.cli.files import (
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
+from piezo_ident.model.axes_file import load
 from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.multi_axis import (
     each_of,
     is_measured,
-    load,
     models_of,
     MultiAxisModel,
     voltage_of,
@@ -212,7 +212,8 @@ def _at_rate(model: StageModel | MultiAxisModel, rate: float) -> StageModel | Mu
     """Give a model the rate of a motion that it takes: a static one holds for any."""
     if isinstance(model, StageModel):
         return replace(model, sample_rate=rate)
-    return MultiAxisModel({k: replace(x, sample_rate=rate) for k, x in model.axes.items()})
+    axes = {k: replace(x, sample_rate=rate) for k, x in model.axes.items()}
+    return replace(model, axes=axes)
 
 
 def _wanted(model: MultiAxisModel, reference: Record, console: Console) -> dict[str, Array]:

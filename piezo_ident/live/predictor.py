@@ -93,6 +93,8 @@ class AxesRun:
 
 def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
     """Refuse a model of other axes than those of a node with a ModelError."""
+    if isinstance(model, MultiAxisModel):
+        model.require_chains('live')
     held = models_of(model)
     if set(held) != set(axes):
         raise ModelError(

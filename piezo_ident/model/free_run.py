@@ -11,7 +11,7 @@ crossed along a straight line of voltage.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -152,14 +152,22 @@ def free_run(model: StageModel, record: Record) -> FreeRun:
             # bridged samples count, including the gaps before this piece
             gone = round((piece.start_time - pieces[0].start_time) * piece.sample_rate)
             late.append(min(max(left - gone, 0), piece.n))
-    warnings = list(_on_starts(model, record, starts))
+    run = compared(model, record, predicted, late)
+    warnings = (*_on_starts(model, record, starts), *run.warnings)
+    return replace(run, estimated=tuple(estimated), warnings=warnings)
+
+
+def compared(
+    model: StageModel, record: Record, predicted: Sequence[Array], late: Sequence[int]
+) -> FreeRun:
+    """Compare predictions with a record without faults; `model` holds scaling and range."""
     pairs = [(piece.y, y_hat) for piece, y_hat in zip(record, predicted, strict=True)]
-    warnings += [f'{record.name}: {doubt}' for doubt in doubts(pairs, model.scaling.Y)]
+    warnings = [f'{record.name}: {doubt}' for doubt in doubts(pairs, model.scaling.Y)]
     return FreeRun(
         model=model,
         record=record,
         pieces=tuple(predicted),
-        estimated=tuple(estimated),
+        estimated=(False,) * len(late),
         late=tuple(late),
         errors=_errors(record, predicted, [0] * len(late)),
         errors_after_start=_errors(record, predicted, late) if _judged(record, late) else None,

@@ -14,12 +14,15 @@ channel is the motion.  An axis has the name of its displacement in a record:
 |---|---|---|---|
 | first | ``v`` | ``y`` | ``motion`` |
 | ``b`` | ``v_b`` | ``y_b`` | ``motion_b`` |
+
+Hysteresis inside the loop of modes that the axes share is no sum of chains.  A model with such
+`modes` (`piezo_ident.model.modes.shared_modes`) predicts all displacements by them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import os
 from types import MappingProxyType
 from typing import Any, Generic, TYPE_CHECKING, TypeVar
@@ -28,15 +31,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array, interpolated
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.common.files import load_yaml, write_text
-from piezo_ident.model.files import (
-    check_version,
-    model_from_dict,
-    model_to_dict,
-    model_to_yaml,
-    yaml_text,
-)
+from piezo_ident.common.files import write_text
 from piezo_ident.model.free_run import free_run, predict
+from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record
@@ -46,8 +43,6 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
-#: version of a model file with several axes
-SCHEMA_VERSION = 2
 MOTION = 'motion'
 
 
@@ -151,6 +146,8 @@ class EachAxis(Mapping[str, T], Generic[T]):
     """
     Results of a verb for each axis of a stage, by the name of its displacement.
 
+    `modes` are modes that the axes share, if the verb found hysteresis inside their loop.
+
     Examples
     --------
     >>> errors = EachAxis({'y': 0.2, 'y_b': 0.3})
@@ -159,6 +156,7 @@ class EachAxis(Mapping[str, T], Generic[T]):
     """
 
     axes: Mapping[str, T]
+    modes: SharedModes | None = field(default=None, kw_only=True)
 
     def __getitem__(self, axis: str) -> T:
         """Return the result of an axis."""
@@ -178,7 +176,7 @@ class EachAxis(Mapping[str, T], Generic[T]):
 
     def mapped(self, change: Callable[[str, T], T]) -> EachAxis[T]:
         """Apply a function to the name and the result of each axis."""
-        return EachAxis({axis: change(axis, x) for axis, x in self.items()})
+        return EachAxis({axis: change(axis, x) for axis, x in self.items()}, modes=self.modes)
 
     def told(self, text: Callable[[T], str]) -> str:
         """Join a text for each axis, under the name of the axis."""
@@ -187,7 +185,7 @@ class EachAxis(Mapping[str, T], Generic[T]):
     @property
     def model(self) -> MultiAxisModel:
         """Model of the stage, from results that hold a model for each axis."""
-        return MultiAxisModel(self._of_each('model'))
+        return MultiAxisModel(self._of_each('model'), self.modes)
 
     @property
     def errors(self) -> Mapping[str, Any]:
@@ -223,11 +221,15 @@ class MultiAxisModel:
     ----------
     axes : mapping of str to StageModel
         Models by the name of the displacement: ``y``, ``y_b``.
+    modes : SharedModes, optional
+        Modes that the axes share, with their voltages and displacements in alphabetical order.
+        They predict instead of the chains.  The chains keep range and scaling.
 
     Raises
     ------
     ModelError
-        When the axes have different sampling rates, or a path has no source.
+        When the axes have different sampling rates, a path has no source, or the modes are of
+        another number of axes.
 
     Examples
     --------
@@ -250,6 +252,7 @@ class MultiAxisModel:
     """
 
     axes: Mapping[str, StageModel]
+    modes: SharedModes | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'axes', MappingProxyType(dict(self.axes)))
@@ -257,6 +260,8 @@ class MultiAxisModel:
             raise ModelError('model: has no axis; see docs/two_axes.md')
         if len({model.sample_rate for model in self.axes.values()}) != 1:
             raise ModelError('model: the axes differ in sample_rate; give axes of one rate')
+        if self.modes is not None and self.modes.linear.d.shape != (len(self.axes),) * 2:
+            raise ModelError('model: the modes are of another number of axes; diagnose again')
         for axis, model in self.axes.items():
             others = [motion_of(k) for k in self.axes if k != axis]
             for effect in model.effects:
@@ -268,7 +273,8 @@ class MultiAxisModel:
 
     def __repr__(self) -> str:
         lines = (f'  {axis}: {model!r}' for axis, model in self.axes.items())
-        return '\n'.join(['MultiAxisModel:', *lines])
+        shared = [] if self.modes is None else [f'  shared: {self.modes.linear.order} states']
+        return '\n'.join(['MultiAxisModel:', *lines, *shared])
 
     @property
     def sample_rate(self) -> float:
@@ -280,6 +286,14 @@ class MultiAxisModel:
         model = self.axes[axis]
         kept = tuple(e for e in model.effects if not e.channel.startswith(MOTION))
         return replace(model, effects=kept)
+
+    def require_chains(self, verb: str) -> None:
+        """Refuse a model with shared modes for a verb that runs chains alone."""
+        if self.modes is not None:
+            raise ModelError(
+                f'{verb}: cannot run the modes that the axes share, with hysteresis inside their '
+                'loop; predict can. MultiAxisModel(model.axes) is the model without them'
+            )
 
     def takes(self, piece: Piece) -> bool:
         """Return whether the model holds at the sampling rate of a piece."""
@@ -310,7 +324,7 @@ class MultiAxisModel:
     def seen(self, record: Record) -> dict[str, Record]:
         """Split a record by axis, with the motions of the other axes as channels."""
         self.check_axes({c for piece in record for c in _columns(piece)}, record.name)
-        motions = self.motions(record)
+        motions = None if self.modes is not None else self.motions(record)
         return {axis: axis_record(record, axis, motions) for axis in self.axes}
 
     def simulate(
@@ -340,6 +354,8 @@ class MultiAxisModel:
         v, further = {a: voltages[voltage_of(a)] for a in self.axes}, dict(channels or {})
         if len({np.size(x) for x in v.values()}) > 1:
             raise DataError('simulate: the voltages of the axes differ in length')
+        if self.modes is not None:
+            return self.modes.of_axes(v)
         own = {a: self.own(a).simulate(v[a], channels=further) for a in self.axes}
         moved = {motion_of(a): m for a, m in own.items()}
         return {
@@ -349,8 +365,22 @@ class MultiAxisModel:
             for axis, model in self.axes.items()
         }
 
+    def predicted(self, record: Record) -> dict[str, tuple[Array, ...]]:
+        """Predict the displacement of each axis from the voltages alone [m], piece by piece."""
+        seen = self.seen(record)
+        for piece in record:
+            self.check_rate(piece)
+        if self.modes is None:
+            return {axis: predict(x, seen[axis]) for axis, x in self.axes.items()}
+        pieces = zip(*seen.values(), strict=True)
+        columns = [{a: p.v for a, p in zip(seen, axes, strict=True)} for axes in pieces]
+        runs = [self.modes.of_axes(v) for v in columns]
+        return {axis: tuple(run[axis] for run in runs) for axis in self.axes}
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model file; an old file stays whole until the new file is complete."""
+        from piezo_ident.model.axes_file import text_of
+
         write_text(path, text_of(self))
 
 
@@ -372,56 +402,3 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """List the model of each axis without the paths of the others."""
     return {'y': model} if isinstance(model, StageModel) else {a: model.own(a) for a in model.axes}
-
-
-def text_of(model: StageModel | MultiAxisModel) -> str:
-    """Write a model as the text of its file."""
-    if isinstance(model, StageModel):
-        return model_to_yaml(model)
-    of_axes = {axis: model_to_dict(x) for axis, x in model.axes.items()}
-    return yaml_text({'schema_version': SCHEMA_VERSION, 'axes': of_axes})
-
-
-def from_dict(data: Mapping[str, Any], name: str) -> StageModel | MultiAxisModel:
-    """Build a model of one axis or of several from the contents of its file."""
-    return (multi_axis_from_dict if 'axes' in data else model_from_dict)(data, name)
-
-
-def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
-    """Build a model of several axes from the contents of its file; raise ModelError on a fault."""
-    check_version(data, name, SCHEMA_VERSION)
-    axes = data['axes']
-    if not (
-        isinstance(axes, Mapping) and axes and all(isinstance(x, Mapping) for x in axes.values())
-    ):
-        raise ModelError(f'{name}: axes must name a model for each axis; see docs/two_axes.md')
-    if wrong := [str(k) for k in axes if k != 'y' and role_of(str(k)) != 'y']:
-        raise ModelError(f'{name}: axes {", ".join(wrong)}: an axis is y, or y_ and its name')
-    try:
-        return MultiAxisModel(
-            {str(k): model_from_dict(x, f'{name}: axes.{k}') for k, x in axes.items()}
-        )
-    except ModelError as error:
-        raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
-
-
-def load(path: str | os.PathLike[str]) -> StageModel | MultiAxisModel:
-    """
-    Read a model file, of one axis or of several.
-
-    Raises
-    ------
-    ConfigError
-        When the file cannot be read or is not YAML.
-    ModelError
-        When the file does not hold a model, or has a later schema.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> pi.SimulatedStage.load('paper').model.save('model.yaml')
-    >>> model = pi.load('model.yaml')
-    >>> model.sample_rate, model.hysteresis.thresholds.size
-    (20000.0, 9)
-    """
-    return from_dict(load_yaml(path), str(path))

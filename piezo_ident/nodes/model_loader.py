@@ -13,7 +13,8 @@ from typing import Generic, TypeAlias, TypeVar
 
 from piezo_ident.common.errors import naming, PiezoIdentError
 from piezo_ident.common.files import parse_yaml
-from piezo_ident.model.multi_axis import from_dict, load, MultiAxisModel
+from piezo_ident.model.axes_file import from_dict, load
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.wire import LATCHED
 from rclpy.node import Node

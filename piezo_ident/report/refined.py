@@ -5,16 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.identification.warnings import LAW_WORDS
-from piezo_ident.model.free_run import free_run, same_part_errors
-from piezo_ident.model.multi_axis import EachAxis
+from piezo_ident.model.free_run import FreeRun, same_part_errors
+from piezo_ident.model.multi_axis import each_of, EachAxis, MultiAxisModel
 from piezo_ident.model.sines import sine_errors
 from piezo_ident.record.record import Record
 from piezo_ident.report.table import number
+from piezo_ident.verbs.predict import free_run
 
 
 def validated(
@@ -29,21 +30,24 @@ def validated(
         When a piece has another sampling rate than the models.
     """
     if isinstance(result, EachAxis):
-        seen = [result.model.seen(record) for record in records]
-        return EachAxis(
-            {
-                axis: replace(x, unseen=(*x.unseen, *(_unseen(x, of[axis]) for of in seen)))
-                for axis, x in result.items()
-            }
-        )
-    unseen = [_unseen(result, record) for record in records]
-    return replace(result, unseen=(*result.unseen, *unseen))
+        model, chains = result.model, MultiAxisModel(result.model.axes)
+        seen = [chains.seen(record) for record in records]
+        runs = [each_of(free_run(model, record)) if model.modes else {} for record in records]
+        parts = [*zip(seen, runs, strict=True)]
+        return result.mapped(lambda a, x: _judged(x, [(of[a], run.get(a)) for of, run in parts]))
+    return _judged(result, [(record, None) for record in records])
 
 
-def _unseen(result: Diagnosis, record: Record) -> Unseen:
-    models = (result.given, result.model)
-    before, after = same_part_errors(*(free_run(model, record) for model in models))
-    sines = zip(*(sine_errors(model, record) for model in models), strict=True)
+def _judged(result: Diagnosis, parts: Iterable[tuple[Record, FreeRun | None]]) -> Diagnosis:
+    """Add the errors on records; a run of shared modes replaces that of the refined model."""
+    return replace(result, unseen=(*result.unseen, *(_unseen(result, *x) for x in parts)))
+
+
+def _unseen(result: Diagnosis, record: Record, refined: FreeRun | None) -> Unseen:
+    given, model = result.given, result.model
+    runs = free_run(given, record), refined or free_run(model, record)
+    before, after = same_part_errors(*runs)
+    sines = zip(sine_errors(given, record), sine_errors(model, record), strict=True)
     return Unseen(
         record=record.name,
         before=before.percent,
@@ -51,7 +55,7 @@ def _unseen(result: Diagnosis, record: Record) -> Unseen:
         before_centred=before.percent_without_offset,
         after_centred=after.percent_without_offset,
         n=after.n,
-        sines=tuple((a.frequency, a.percent, b.percent) for a, b in sines),
+        sines=() if refined else tuple((a.frequency, a.percent, b.percent) for a, b in sines),
     )
 
 

@@ -53,6 +53,7 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     """
     if not isinstance(model, MultiAxisModel):
         return export_axis(model, name, **options)
+    model.require_chains('export')
     tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
     alike = [axis for axis in tags if [*tags.values()].count(tags[axis]) > 1]
     if alike:

@@ -140,6 +140,7 @@ def invert(
         if isinstance(wanted, Mapping):
             raise DataError('invert: the model has one axis; give one motion')
         return invert_axis(model, wanted, channels=channels, **options)
+    model.require_chains('invert')
     goals = _goals(model, wanted)
     moved, found = dict(goals), dict[str, Inverse]()
     for _ in range(ROUNDS):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+import functools
 from typing import Any, overload
 
 import numpy as np
@@ -14,6 +15,8 @@ from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
+from piezo_ident.diagnosis.shared_modes import find_shared_modes, with_shared_modes
+from piezo_ident.diagnosis.shared_modes import NAME as LOOP
 from piezo_ident.identification.identify import identify_and_judge
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.identification.settings import Progress, Settings, silent
@@ -213,8 +216,11 @@ def diagnose(
     """
     if not isinstance(model, MultiAxisModel):
         return diagnose_axis(model, records, settings, progress=progress)
-    seen = [model.seen(record) for record in records_of(records, 'diagnose, second argument')]
-    return EachAxis(
+    model.require_chains('diagnose')
+    settings = DiagnosisSettings() if settings is None else settings
+    records = records_of(records, 'diagnose, second argument')
+    seen = [model.seen(record) for record in records]
+    found = EachAxis(
         {
             axis: diagnose_axis(
                 x, [of[axis] for of in seen], settings, progress=_named(progress, axis)
@@ -222,6 +228,15 @@ def diagnose(
             for axis, x in model.axes.items()
         }
     )
+    names = {*(settings.effects or (LOOP,))} - {*settings.without}
+    shared = find_shared_modes(found.model, records, progress) if LOOP in names else None
+    if shared is None:
+        return found
+    found = replace(found, modes=shared.modes)
+    judged = functools.partial(
+        with_shared_modes, finding=shared, model=found.model, records=records
+    )
+    return found.mapped(lambda axis, x: judged(x, axis))
 
 
 def _named(progress: Progress, axis: str) -> Progress:

@@ -9,9 +9,9 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import overload
 
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError, expect
+from piezo_ident.common.errors import DataError, expect, ModelError
+from piezo_ident.model.free_run import compared, FreeRun
 from piezo_ident.model.free_run import free_run as run_axis
-from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.free_run import predict as predict_axis
 from piezo_ident.model.initial_memory import unknown_starts
 from piezo_ident.model.multi_axis import (
@@ -22,6 +22,7 @@ from piezo_ident.model.multi_axis import (
     MultiAxisModel,
 )
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
 from piezo_ident.uncertainty.prediction import half_widths, with_interval
 
@@ -97,7 +98,29 @@ def free_run(
             f'{record.name}: has no displacement of {", ".join(unknown)} to compare with; name '
             "the other axes in 'axes', or predict from the voltages alone"
         )
-    return EachAxis({a: free_run(model.axes[a], seen[a], interval) for a in axes or model.axes})
+    kept = {axis: seen[axis] for axis in axes or model.axes}
+    if model.modes is not None:
+        _refuse_band(interval)
+        return EachAxis(_of_modes(model, model.modes.settling, record, kept))
+    return EachAxis({axis: free_run(model.axes[axis], x, interval) for axis, x in kept.items()})
+
+
+def _of_modes(
+    model: MultiAxisModel, settling: int, record: Record, seen: Mapping[str, Record]
+) -> dict[str, FreeRun]:
+    """Compare the prediction of shared modes with the record of each axis."""
+    predicted = model.predicted(record)
+    # no prediction knows the motion before a record
+    late = [min(settling, piece.n) for piece in record]
+    return {
+        axis: compared(model.axes[axis], without_faults(one), predicted[axis], late)
+        for axis, one in seen.items()
+    }
+
+
+def _refuse_band(interval: float | None) -> None:
+    if interval is not None:
+        raise ModelError('the model predicts by shared modes, and they carry no band')
 
 
 def predict(
@@ -106,8 +129,7 @@ def predict(
     """Predict the displacement from the voltages alone; an array for each piece [m]."""
     if not isinstance(model, MultiAxisModel):
         return predict_axis(model, record)
-    seen = model.seen(record)
-    return EachAxis({axis: predict_axis(x, seen[axis]) for axis, x in model.axes.items()})
+    return EachAxis(model.predicted(record))
 
 
 def bands(
@@ -118,6 +140,8 @@ def bands(
 ) -> dict[str, tuple[Array, ...]]:
     """Compute the half widths [m] of predictions from voltages alone, by axis."""
     models = models_of(model)
+    if isinstance(model, MultiAxisModel) and model.modes is not None:
+        _refuse_band(interval)
     seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
     return {k: half_widths(models[k], seen[k], x, interval) for k, x in predicted.items()}
 

@@ -35,7 +35,6 @@ ROOMS = (
     'fitting',
     'selection',
     'identification',
-    'axes',
     'diagnosis',
     'uncertainty',
     'control',

@@ -31,6 +31,7 @@ from piezo_ident.live.capture import (
     refuse_missing,
     Snapshot,
 )
+from piezo_ident.model.axes_file import text_of
 from piezo_ident.model.free_run import piece_runs, PieceRun
 from piezo_ident.model.multi_axis import (
     each_of,
@@ -38,7 +39,6 @@ from piezo_ident.model.multi_axis import (
     mapped,
     models_of,
     MultiAxisModel,
-    text_of,
     voltage_of,
 )
 from piezo_ident.model.simulated_stage import SimulatedStage

@@ -18,7 +18,8 @@ from piezo_ident.common.process import Tick
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
-from piezo_ident.model.multi_axis import each_of, EachAxis, load
+from piezo_ident.model.axes_file import load
+from piezo_ident.model.multi_axis import each_of, EachAxis
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
 from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs

@@ -14,7 +14,8 @@ from piezo_ident.diagnosis import DiagnosisSettings
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
 from piezo_ident.live.capture import Capture
-from piezo_ident.model.multi_axis import from_dict, MultiAxisModel
+from piezo_ident.model.axes_file import from_dict
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.identifier.jobs import diagnose_capture, identify_capture, percent_of
 from piezo_ident.record.blocks import Samples

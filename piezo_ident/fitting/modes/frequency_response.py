@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
+from piezo_ident.fitting.modes.periods import PeriodicRecord
 
 #: a line whose voltage is smaller than this part of the largest is not excited
 EXCITED = 0.02
@@ -47,7 +48,7 @@ class LineResponse:
         return np.asarray(np.exp(2j * np.pi * self.lines / self.samples))
 
     @property
-    def size(self) -> NDArray[np.float64]:
+    def size(self) -> Array:
         """The rms of the response of each output, 1 where there is none; shape (outputs, 1)."""
         size = np.sqrt(np.mean(np.abs(self.g) ** 2, axis=(0, 2)))[:, None]
         return np.where(size > 0, size, 1)
@@ -76,19 +77,13 @@ def frequency_response(
     degree : int
         Degree of the polynomial.
     """
-    shapes = {(r.u.shape[1:], r.y.shape[1:], r.rate) for r in records}
-    if len(shapes) != 1:
-        raise DataError(f'the records differ in samples, channels or rate: {sorted(shapes)}')
     lines = excited_lines(records)
     u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
     y = np.array([np.fft.rfft(r.mean_y, axis=0)[lines] for r in records])
     inputs, outputs = u.shape[2], y.shape[2]
     width = 2 * half_width + 1
     if len(lines) < width:
-        raise DataError(
-            f'the inputs share {len(lines)} lines of a period, {width} are needed; drive every '
-            'axis by a multisine of its own of the same many lines (docs/two_axes.md)'
-        )
+        raise DataError(f'the inputs share {len(lines)} lines of a period, {width} are needed')
     unknown, known = inputs * (degree + 1), width * len(records)
     if known < unknown:
         raise DataError(
@@ -97,44 +92,16 @@ def frequency_response(
         )
     g = np.zeros((len(lines), outputs, inputs), complex)
     for i in range(len(lines)):
-        columns, near = neighbours(u, lines, i, half_width, degree)
+        low = max(0, min(i - half_width, len(lines) - width))
+        near = slice(low, low + width)
+        powers = np.vander((lines[near] - lines[i]) / half_width, degree + 1, increasing=True)
+        columns = (u[:, near, None, :] * powers[None, :, :, None]).reshape(known, unknown)
         solution = np.linalg.lstsq(columns, y[:, near].reshape(-1, outputs), rcond=None)[0]
         g[i] = solution[:inputs].T
     return LineResponse(lines, len(records[0].mean_u), g)
 
 
-def neighbours(
-    u: NDArray[np.complex128], lines: NDArray[np.intp], at: int, half_width: int, degree: int
-) -> tuple[NDArray[np.complex128], slice]:
-    """
-    Return the columns of a local polynomial, inputs first, and the lines that it is fitted to.
-
-    u has the shape (records, lines, inputs), the middle is ``lines[at]``; a row of the columns is
-    a line of a record.
-    """
-    width = 2 * half_width + 1
-    low = max(0, min(at - half_width, len(lines) - width))
-    near = slice(low, low + width)
-    powers = np.vander((lines[near] - lines[at]) / half_width, degree + 1, increasing=True)
-    columns = u[:, near, None, :] * powers[None, :, :, None]
-    return columns.reshape(-1, u.shape[2] * (degree + 1)), near
-
-
-def likeness(records: Sequence[PeriodicRecord], *, half_width: int = 4) -> NDArray[np.float64]:
-    """
-    Return how much the inputs are one signal, shape (inputs, inputs).
-
-    Of each pair the coherence over the neighbours of a line and all records, 0 to 1, median over
-    the lines: with 1 nothing tells what either of them moves.  0 where there are too few lines.
-    """
-    lines = excited_lines(records)
-    width = 2 * half_width + 1
-    if len(lines) < width:
-        return np.zeros((records[0].u.shape[2],) * 2)
-    u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
-    products = np.einsum('rki,rkj->kij', u.conj(), u)
-    sums = np.cumsum(np.concatenate([0 * products[:1], products]), axis=0)
-    near = sums[width:] - sums[:-width]
-    power = np.real(np.einsum('kii->ki', near))
-    coherence = np.abs(near) ** 2 / (power[:, :, None] * power[:, None, :])
-    return np.asarray(np.median(coherence, axis=0))
+def likeness(records: Sequence[PeriodicRecord]) -> float:
+    """Compute the largest correlation of two voltages over all records, 0 to 1."""
+    u = np.concatenate([r.mean_u for r in records])
+    return float(np.abs(np.triu(np.corrcoef(u.T), 1)).max())

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import axes_stage as stage
 import numpy as np
-from piezo_ident.axes.frequency_response import excited_lines, frequency_response
-from piezo_ident.axes.linear_fit import choose_order, linear_error, linear_fit, refined
-from piezo_ident.axes.loop_fit import loop_fit
-from piezo_ident.axes.loop_model import LoopModel
-from piezo_ident.axes.modal import Modal, narrowest, to_modal
-from piezo_ident.axes.periodic import periodicity, PeriodicRecord
-from piezo_ident.axes.subspace import subspace
 from piezo_ident.common.errors import DataError, IdentificationError, ModelError
+from piezo_ident.fitting.modes.frequency_response import excited_lines, frequency_response
+from piezo_ident.fitting.modes.linear_fit import choose_order, refined
+from piezo_ident.fitting.modes.loop_fit import loop_fit
+from piezo_ident.fitting.modes.periods import differences, PeriodicRecord, weighted
+from piezo_ident.fitting.modes.subspace import subspace
+from piezo_ident.model.modes.modal import Modal, narrowest, to_modal
+from piezo_ident.model.modes.shared_modes import SharedModes
 import pytest
 
 
@@ -23,36 +23,18 @@ def noisy():
     )
 
 
-def test_a_record_states_what_is_wrong_with_it():
-    u, y = np.ones((2, 8, 1)), np.ones((2, 9, 1))
-    with pytest.raises(DataError, match='equal periods and samples'):
-        PeriodicRecord('a', 'b', 1.0, u, y)
-    with pytest.raises(DataError, match='rests throughout'):
-        PeriodicRecord('a', 'b', 1.0, u, y[:, :8])
-    with pytest.raises(DataError, match='not finite'):
-        PeriodicRecord('a', 'b', 1.0, u * np.nan, y[:, :8])
-
-
-def test_periodicity_finds_the_record_that_changed_between_periods(noisy):
-    rng = np.random.default_rng(2)
+def test_a_record_that_changed_between_periods_counts_less(noisy):
     changed = noisy[2]
-    lines = np.zeros((stage.SAMPLES // 2 + 1, 2), complex)
-    at = slice(600, 700)  # 586 to 684 Hz
-    lines[at] = np.exp(2j * np.pi * rng.random((100, 2)))
-    other = np.fft.irfft(lines, stage.SAMPLES, axis=0)
     y = changed.y.copy()
-    y[1] += 0.1 * y.std() * other / other.std()
-    tested = periodicity(
-        [*noisy[:2], PeriodicRecord('changed', '1', stage.RATE, changed.u, y), *noisy[3:]]
-    )
-    assert [t.suspicious for t in tested] == [False, False, True, False, False, False]
-    found = tested[2]
-    assert found.band[0] <= 600 * stage.RATE / stage.SAMPLES
-    assert 684 <= found.band[1] < 760
-    assert found.difference == pytest.approx(10, rel=0.1)
-    assert found.weight == pytest.approx(0.14, rel=0.15) and tested[0].weight == 1
-    assert tested[0].difference == pytest.approx(np.sqrt(2), rel=0.1)
-    assert 'changed' in str(found) and 'counts 0.14' in str(found)
+    other = stage.multisine(np.random.default_rng(2), 1.0)
+    y[1] += 0.1 * y.std() * other
+    records = [*noisy[:2], PeriodicRecord('changed', '1', stage.RATE, changed.u, y), *noisy[3:]]
+    weights = np.array([r.weight for r in weighted(records)])
+    found = differences(records)
+    assert weights[[0, 1, 3, 4, 5]] == pytest.approx(1)
+    assert weights[2] == pytest.approx(0.14, rel=0.15)
+    assert found[2] == pytest.approx(0.1, rel=0.1)
+    assert found[0] == pytest.approx(0.01 * np.sqrt(2), rel=0.1)
 
 
 def test_response_agrees_with_the_truth_within_the_noise(noisy):
@@ -84,7 +66,7 @@ def test_refinement_recovers_the_stage_to_the_noise(noisy):
     start = subspace(frequency_response(noisy[:4]), 4)
     found = refined(start, frequency_response(noisy[:4]))
     for record in noisy[4:]:
-        assert linear_error(found, record) == pytest.approx(1.0, rel=0.15)
+        assert stage.percent(SharedModes.of(found), [record]) == pytest.approx(1.0, rel=0.15)
     assert found.radius < 1
     assert stage.modes(found.a)[0] == pytest.approx([190, 310], rel=1e-3)
 
@@ -100,8 +82,11 @@ def test_an_axis_of_a_short_stroke_is_fitted_as_well():
     ]
     start, errors = choose_order(records[:4], records[4:], orders=(2, 4, 8))
     assert start.order == 4 and errors[4] == pytest.approx(1.0, rel=0.15)
-    for model in (LoopModel.of(start), loop_fit(LoopModel.of(start), records[:4], iterations=3)):
-        error = model.error(records[5]).std(axis=0) / records[5].y[-1].std(axis=0)
+    for model in (
+        SharedModes.of(start),
+        loop_fit(SharedModes.of(start), records[:4], iterations=3),
+    ):
+        error = stage.error(model, records[5]).std(axis=0) / records[5].y[-1].std(axis=0)
         assert error == pytest.approx(0.01, rel=0.2)
 
 
@@ -112,7 +97,8 @@ def test_order_is_chosen_by_held_out_error(noisy):
 
 
 def test_a_model_of_too_high_an_order_stays_stable(noisy):
-    assert linear_fit(frequency_response(noisy), 12, iterations=3).radius < 1
+    response = frequency_response(noisy)
+    assert refined(subspace(response, 12), response, iterations=3).radius < 1
 
 
 def test_a_mode_narrower_than_a_line_is_widened_and_holds_up_nothing(noisy):
@@ -127,10 +113,10 @@ def test_a_mode_narrower_than_a_line_is_widened_and_holds_up_nothing(noisy):
     limit = narrowest(stage.SAMPLES)
     found = refined(start, frequency_response(noisy[:4]))
     assert found.radius <= limit + 1e-12
-    model = loop_fit(LoopModel.of(start), noisy[:4], iterations=10)
+    model = loop_fit(SharedModes.of(start), noisy[:4], iterations=10)
     assert model.linear.radius <= limit + 1e-12
     for linear in (found, model.linear):
-        assert linear_error(linear, noisy[4]) == pytest.approx(1.0, rel=0.15)
+        assert stage.percent(SharedModes.of(linear), [noisy[4]]) == pytest.approx(1.0, rel=0.15)
 
 
 def test_poles_beyond_the_circle_are_mirrored_and_odd_orders_refused():

@@ -20,6 +20,8 @@ changes.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
@@ -31,47 +33,56 @@ KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')
 CHUNK = 64
 
 
-@kernel
-def trajectory(
-    u: Array,
-    blocks: Array,
-    b: Array,
-    e: Array,
-    f: Array,
-    g: Array,
-    c: Array,
-    d: Array,
-    h: Array,
-    mu: Array,
-    r: Array,
-    levels: int,
-    low: float,
-    high: float,
-    kappa: float,
-    x: Array,
-    memory: Array,
-    level: Array,
-    xs: Array,
-    zs: Array,
-    ps: Array,
-    plays: Array,
-    gates: NDArray[np.uint8],
-    ls: Array,
-    ys: Array,
-) -> int:
-    """
-    Run the loop over u; carry x, memory and level on, write what passes into xs ... ys.
+class Loop(NamedTuple):
+    """Arrays and numbers of the equations above; `low` and `high` clip s."""
 
-    Returns the samples that were run: fewer than u where the stage runs away.
+    blocks: Array
+    b: Array
+    c: Array
+    d: Array
+    e: Array
+    h: Array
+    f: Array
+    g: Array
+    mu: Array
+    r: Array
+    levels: int
+    low: float
+    high: float
+    kappa: float
+
+
+class Passage(NamedTuple):
+    """States, signals, pushes, plays, gates, squared level and outputs, one row a sample."""
+
+    x: Array
+    z: Array
+    p: Array
+    plays: Array
+    gates: NDArray[np.uint8]
+    level: Array
+    y: Array
+
+
+@kernel
+def trajectory(u: Array, loop: Loop, run: Passage) -> int:
     """
+    Run the loop over u from rest, and write what passes into `run`.
+
+    The result is the number of samples that were run: fewer than u if the stage runs away.
+    """
+    blocks, b, c, d, e, h = loop.blocks, loop.b, loop.c, loop.d, loop.e, loop.h
+    f, g, mu, r, levels, kappa = loop.f, loop.g, loop.mu, loop.r, loop.levels, loop.kappa
+    xs, zs, ps, plays, gates, ls, ys = run
     samples, inputs = u.shape
     order, signals = e.shape
     thresholds = len(r)
+    x, memory, level = np.zeros(order), np.zeros(mu.shape), 1.0
     p = np.zeros(signals)
     new = np.zeros(order)
     for t in range(samples):
-        ls[t] = level[0]
-        softening = min(max(np.sqrt(level[0]), low), high) - 1.0
+        ls[t] = level
+        softening = min(max(np.sqrt(level), loop.low), loop.high) - 1.0
         squares = 0.0
         for i in range(order):
             xs[t, i] = x[i]
@@ -111,7 +122,7 @@ def trajectory(
                 y += h[o, j] * p[j]
             ys[t, o] = y
         if levels > 0:
-            level[0] = alive(kappa * level[0] + (1.0 - kappa) * squares / levels)
+            level = alive(kappa * level + (1.0 - kappa) * squares / levels)
         for i in range(0, order, 2):
             block = i // 2
             new[i] = blocks[block, 0, 0] * x[i] + blocks[block, 0, 1] * x[i + 1]
@@ -134,22 +145,8 @@ def sensitivities(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     u: Array,
-    blocks: Array,
-    e: Array,
-    f: Array,
-    mu: Array,
-    c: Array,
-    h: Array,
-    levels: int,
-    low: float,
-    high: float,
-    kappa: float,
-    xs: Array,
-    zs: Array,
-    ps: Array,
-    plays: Array,
-    gates: NDArray[np.uint8],
-    ls: Array,
+    loop: Loop,
+    run: Passage,
     skip: int,
     out: NDArray[np.float32],
 ) -> None:
@@ -158,6 +155,9 @@ def sensitivities(
 
     A parameter is `kinds`, a number of `KINDS`, at `rows` and `columns` of its array.
     """
+    blocks, e, f, mu, c, h = loop.blocks, loop.e, loop.f, loop.mu, loop.c, loop.h
+    levels, low, high, kappa = loop.levels, loop.low, loop.high, loop.kappa
+    xs, zs, ps, plays, gates, ls, _ = run
     single = np.float32
     samples = len(u)
     order, signals = e.shape

@@ -15,50 +15,36 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
-from piezo_ident.axes.loop_model import LoopModel
-from piezo_ident.axes.periodic import PeriodicRecord
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
+from piezo_ident.fitting.modes.periods import PeriodicRecord
+from piezo_ident.model.modes.shared_modes import SharedModes
 
 #: of the plays, in units of the rms of their signals
 THRESHOLDS = (0.05, 0.15, 0.4, 1.0, 2.0)
 
 
-def with_softening(
-    model: LoopModel, records: Sequence[PeriodicRecord], *, memory: float = 300.0
-) -> LoopModel:
-    """
-    Let the extensions of the actuators soften the stage by their level.
-
-    Parameters
-    ----------
-    records : sequence of PeriodicRecord
-        The level s is 1 at the middle one of their amplitudes.
-    memory : float
-        Time constant of the level in samples.
-    """
+def with_softening(model: SharedModes, records: Sequence[PeriodicRecord]) -> SharedModes:
+    """Let the extensions of the actuators soften the stage; their level is 1 in the records."""
     if model.signals:
         raise ModelError('softening comes before the plays')
-    loudness = np.array([np.sqrt(np.mean(r.u**2)) for r in records])
-    middle = loudness[np.abs(loudness - np.median(loudness)).argmin()]
-    at = [r for r, x in zip(records, loudness, strict=True) if abs(x - middle) < 0.05 * middle]
-    new = _with(model, *_extension(model), at, plays=False)
-    return replace(new, levels=new.signals, memory=memory)
+    new = _with(model, *_extension(model), records, plays=False)
+    return replace(new, levels=new.signals)
 
 
-def with_loop_plays(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
+def with_loop_plays(model: SharedModes, records: Sequence[PeriodicRecord]) -> SharedModes:
     """Add plays of the extensions of the actuators: hysteresis inside the mechanics."""
     return _with(model, *_extension(model), records)
 
 
-def with_input_plays(model: LoopModel, records: Sequence[PeriodicRecord]) -> LoopModel:
+def with_input_plays(model: SharedModes, records: Sequence[PeriodicRecord]) -> SharedModes:
     """Add plays of the voltages."""
     inputs = model.linear.b.shape[1]
     f, g = np.zeros((inputs, model.linear.order)), np.eye(inputs)
     return _with(model, f, g, records)
 
 
-def _extension(model: LoopModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extension(model: SharedModes) -> tuple[Array, Array]:
     """Return F and G of G(0)^-1 y: what the outputs would take of the inputs at rest."""
     gain = model.linear.response(np.ones(1, complex))[0].real
     back = np.linalg.pinv(gain)
@@ -66,13 +52,13 @@ def _extension(model: LoopModel) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def _with(
-    model: LoopModel,
-    f: NDArray[np.float64],
-    g: NDArray[np.float64],
+    model: SharedModes,
+    f: Array,
+    g: Array,
     records: Sequence[PeriodicRecord],
     *,
     plays: bool = True,
-) -> LoopModel:
+) -> SharedModes:
     squares = []
     for record in records:
         u = record.mean_u

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 
 #: poles stay within
@@ -34,10 +35,10 @@ class Modal:
     b, c, d : ndarray, shapes (n, inputs), (outputs, n), (outputs, inputs)
     """
 
-    blocks: NDArray[np.float64]
-    b: NDArray[np.float64]
-    c: NDArray[np.float64]
-    d: NDArray[np.float64]
+    blocks: Array
+    b: Array
+    c: Array
+    d: Array
 
     @property
     def order(self) -> int:
@@ -50,7 +51,7 @@ class Modal:
         return np.asarray(self.blocks[:, 0, 1] != 0)
 
     @property
-    def a(self) -> NDArray[np.float64]:
+    def a(self) -> Array:
         """A as one matrix."""
         a = np.zeros((self.order, self.order))
         for i, block in enumerate(self.blocks):
@@ -103,16 +104,14 @@ def narrowest(samples: int) -> float:
     return float(np.exp(-np.pi / samples))
 
 
-def resolved(blocks: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+def resolved(blocks: Array, limit: float) -> Array:
     """Return blocks whose complex poles beyond a distance from the origin are drawn in to it."""
     radius = np.hypot(blocks[:, 0, 0], blocks[:, 0, 1])
     beyond = (blocks[:, 0, 1] != 0) & (radius > limit)
     return blocks * np.where(beyond, limit / np.where(beyond, radius, 1), 1)[:, None, None]
 
 
-def to_modal(
-    a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], d: NDArray[np.float64]
-) -> Modal:
+def to_modal(a: Array, b: Array, c: Array, d: Array) -> Modal:
     """
     Bring a model into modal coordinates; poles beyond `RADIUS` are mirrored to within.
 

@@ -15,9 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.axes.frequency_response import LineResponse
-from piezo_ident.axes.modal import balanced, Modal, to_modal
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.fitting.modes.frequency_response import LineResponse
+from piezo_ident.model.modes.modal import balanced, Modal, to_modal
 
 #: rows of blocks in the observability matrix, at most
 ROWS = 120
@@ -53,7 +54,7 @@ def subspace(response: LineResponse, order: int) -> Modal:
     return balanced(replace(model, c=size * model.c, d=size * model.d))
 
 
-def _observability(response: LineResponse, rows: int) -> NDArray[np.float64]:
+def _observability(response: LineResponse, rows: int) -> Array:
     """Return an orthonormal basis of what G spans and the inputs do not, strongest first."""
     inputs = response.g.shape[2]
     powers = response.z[None, :] ** np.arange(rows)[:, None]
@@ -71,9 +72,7 @@ def _observability(response: LineResponse, rows: int) -> NDArray[np.float64]:
     return np.asarray(np.linalg.eigh((left + left.T) / 2)[1][:, ::-1])
 
 
-def _least_squares(
-    columns: NDArray[np.complex128], values: NDArray[np.complex128]
-) -> NDArray[np.float64]:
+def _least_squares(columns: NDArray[np.complex128], values: NDArray[np.complex128]) -> Array:
     return np.asarray(
         np.linalg.lstsq(
             np.vstack([columns.real, columns.imag]),

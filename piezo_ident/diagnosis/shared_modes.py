@@ -1,0 +1,259 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Find hysteresis inside the loop of modes that several axes share.
+
+Each law is one model for all amplitudes.  It is fitted in free run to multisines, and judged on
+one multisine of each amplitude that is held out:
+
+- ``linear``: nothing else;
+- ``plays in front``: plays of the voltages, in front of the mechanics;
+- ``plays``: plays of the actuators' extension inside the loop;
+- ``softening``: stiffness that follows the level of the extension;
+- ``softening and plays``: softening, and plays of extension and voltage inside the loop.
+
+What sits inside the loop moves the modes with the amplitude; what sits in front changes the gain
+alone.  `loop_hysteresis` is therefore named only if linear models of each amplitude err clearly
+less with modes of their own than with those of all.  Without this test, a law with more signals
+may fit a hysteresis of the voltages better than plays in front do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import warnings
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError, IdentificationError, ModelError
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT, TAKES
+from piezo_ident.diagnosis.results import Diagnosis, Errors, FoundEffect, Unexplained
+from piezo_ident.fitting.modes.frequency_response import likeness
+from piezo_ident.fitting.modes.linear_fit import choose_order
+from piezo_ident.fitting.modes.loop_fit import loop_fit
+from piezo_ident.fitting.modes.periods import (
+    groups,
+    percent_of,
+    PeriodicRecord,
+    periods_of,
+)
+from piezo_ident.fitting.modes.signals import with_input_plays, with_loop_plays, with_softening
+from piezo_ident.identification.settings import Progress
+from piezo_ident.model.modes.shared_modes import SharedModes
+from piezo_ident.model.multi_axis import axes_of, MultiAxisModel, voltage_of
+from piezo_ident.record.channels import Axes
+from piezo_ident.record.record import Record
+
+NAME = 'loop_hysteresis'
+#: laws, simplest first; those of `IN_FRONT` leave the modes where they are
+LAWS = ('linear', 'plays in front', 'plays', 'softening', 'softening and plays')
+IN_FRONT = LAWS[:2]
+#: a law is preferred to simpler ones if it takes this share of their error (taste)
+WORTH = 0.1
+#: laws grow on so many records of a group, those of the largest weight (taste: time)
+FEW = 2
+#: largest correlation of two voltages: their paths are then known ten times worse than their sum
+ONE_SIGNAL = 0.98
+#: orders that are tried (taste: the ratio of two is that of their errors' resolution)
+ORDERS = (4, 6, 8, 12, 16, 20, 28, 36, 44, 52)
+#: steps of each part of a fit, and of the last fit to all records (taste: the error falls no more)
+STEPS, LAST_STEPS = 10, 6
+
+
+@dataclass(frozen=True, eq=False)
+class SharedModesFinding:
+    """
+    Modes that axes share, with hysteresis inside their loop.
+
+    Attributes
+    ----------
+    modes : SharedModes
+        Fitted to all multisines.
+    law : str
+        One of `LAWS`.
+    errors : mapping of str to float
+        Error of each law and of ``chains`` on the multisines held out, % of rms(y).
+    """
+
+    modes: SharedModes
+    law: str
+    errors: Mapping[str, float]
+
+
+def find_shared_modes(
+    chains: MultiAxisModel, records: Sequence[Record], progress: Progress
+) -> SharedModesFinding | None:
+    """
+    Find hysteresis inside the loop of shared modes, if chains err more without it.
+
+    The result is None if it is not found, or the records do not hold what it needs: multisines of
+    all axes at once, at two amplitudes, of two realisations each.
+    """
+    if axes_of(records) != tuple(sorted(chains.axes)):
+        return None
+    every, v0 = periods_of(records)
+    parts = groups(every).values()
+    if len(parts) < 2 or min(map(len, parts)) < 2 or max(map(likeness, parts)) > ONE_SIGNAL:
+        return None
+    try:
+        found = _found(chains, every, v0, progress)
+    except (DataError, IdentificationError):
+        # the lines do not tell the axes apart, or determine no order
+        return None
+    return found and replace(found, modes=_placed(found.modes, records))
+
+
+def _found(
+    chains: MultiAxisModel, every: Sequence[PeriodicRecord], v0: Array, progress: Progress
+) -> SharedModesFinding | None:
+    search = LawSearch(every, progress)
+    errors = {'chains': percent_of(search.held_out, _steady(chains, search.held_out, v0))}
+    if errors['chains'] < _smallest(chains, every) or not search.modes_move():
+        return None
+    fitted = search.laws()
+    errors |= {law: search.error(dict.fromkeys(search.groups, x)) for law, x in fitted.items()}
+    limit = min(errors[law] for law in LAWS) / (1 - WORTH)
+    law = next(law for law in LAWS if errors[law] <= limit)
+    if law in IN_FRONT or errors[law] ** 2 > TAKES * errors['chains'] ** 2:
+        return None
+    modes = loop_fit(fitted[law], every, iterations=LAST_STEPS)
+    progress('shared modes', 1.0)
+    return SharedModesFinding(replace(modes, v0=v0), law, errors)
+
+
+def _steady(chains: MultiAxisModel, records: Sequence[PeriodicRecord], v0: Array) -> list[Array]:
+    """Simulate chains over a period, which is run through once before."""
+    answers, order = [], sorted(chains.axes)
+    for record in records:
+        v = np.tile(record.u[-1] + v0, (2, 1))
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            y = chains.simulate(dict(zip(map(voltage_of, order), v.T, strict=True)))
+        answers.append(np.column_stack([y[axis] for axis in order])[len(v) // 2 :])
+    return answers
+
+
+def _smallest(chains: MultiAxisModel, records: Sequence[PeriodicRecord]) -> float:
+    """Compute the smallest effect, in % of rms(y)."""
+    spans = [chains.axes[a].scaling.Y for a in sorted(chains.axes)]
+    rms = np.sqrt(np.mean([np.mean(r.y**2, axis=(0, 1)) for r in records], axis=0))
+    return SMALLEST_EFFECT * float(np.linalg.norm(spans) / np.linalg.norm(rms))
+
+
+def _placed(modes: SharedModes, records: Sequence[Record]) -> SharedModes:
+    """Set the displacements about which the modes hold by the records as a whole."""
+    every = [Axes.of(piece) for record in records for piece in record]
+    left = np.concatenate([axes.outputs - modes.simulate(axes.inputs) for axes in every])
+    return replace(modes, y0=modes.y0 + np.nanmean(left, axis=0))
+
+
+class LawSearch:
+    """
+    Fits of the laws to periodic records; one record of each group is held out.
+
+    Parameters
+    ----------
+    records : sequence of PeriodicRecord
+        At least two in each group, smallest amplitude first.
+    progress : callable
+    """
+
+    def __init__(self, records: Sequence[PeriodicRecord], progress: Progress) -> None:
+        self._progress = progress
+        taught, self.held_out, self._few = list[list[PeriodicRecord]](), [], []
+        for part in groups(records).values():
+            # a record that does not repeat judges nothing
+            *others, out = sorted(part, key=lambda record: record.weight)
+            self.held_out.append(out)
+            taught.append(others)
+            self._few += others[-FEW:]
+        self.groups = [record.group for record in self.held_out]
+        middle = len(taught) // 2
+        self._middle = taught[middle][-FEW:]
+        progress('shared modes', 0.0)
+        start, _ = choose_order(taught[middle], [self.held_out[middle]], orders=ORDERS)
+        progress('shared modes', 0.1)
+        self.plain = SharedModes.of(start)
+        self.linear = loop_fit(self.plain, self._few, iterations=STEPS)
+
+    def _grown(self, modes: SharedModes, still: Sequence[int] = ()) -> SharedModes:
+        """Fit how new signals push, then what they are."""
+        pushes = loop_fit(modes, self._few, hold=('f', 'g', 'mu'), still=still, iterations=2)
+        return loop_fit(pushes, self._few, still=still, iterations=STEPS)
+
+    def error(self, models: Mapping[str, SharedModes]) -> float:
+        """Compute the error of the model of each group on its record held out, in %."""
+        try:
+            answers = [models[r.group].steady(r.u[-1]) for r in self.held_out]
+        except ModelError:
+            return float('inf')
+        return percent_of(self.held_out, answers)
+
+    def modes_move(self) -> bool:
+        """Tell whether linear models of each amplitude err less with modes of their own."""
+        kept, own = {}, {}
+        for group, part in groups(self._few).items():
+            kept[group] = loop_fit(self.linear, part, hold=('poles',), iterations=STEPS)
+            own[group] = loop_fit(kept[group], part, iterations=STEPS)
+        self._progress('shared modes', 0.3)
+        return self.error(own) < (1 - WORTH) * self.error(kept)
+
+    def laws(self) -> dict[str, SharedModes]:
+        """Fit every law."""
+        plain, inputs = self.plain, range(len(self.plain.v0))
+        front = self._grown(with_input_plays(plain, self._middle), inputs)
+        self._progress('shared modes', 0.4)
+        plays = self._grown(with_loop_plays(plain, self._middle))
+        self._progress('shared modes', 0.5)
+        soft = self._grown(with_softening(plain, self._middle))
+        self._progress('shared modes', 0.6)
+        both = self._grown(with_loop_plays(soft, self._middle))
+        both = self._grown(with_input_plays(both, self._middle))
+        self._progress('shared modes', 0.9)
+        return dict(zip(LAWS, (self.linear, front, plays, soft, both), strict=True))
+
+
+def with_shared_modes(
+    result: Diagnosis, axis: str, finding: SharedModesFinding, model: MultiAxisModel,
+    records: Sequence[Record],
+) -> Diagnosis:  # fmt: skip
+    """Name the hysteresis of shared modes in the diagnosis of an axis."""
+    predicted = {
+        (record.name, piece.start_time): y_hat
+        for record in records
+        for piece, y_hat in zip(record, model.predicted(record)[axis], strict=True)
+    }
+    residuals = []
+    for x in result.residuals:
+        e = x.piece.y - predicted[x.record, x.piece.start_time][: x.piece.n]
+        # the sensor may have been zeroed again
+        residuals.append(replace(x, after=e - e[x.sound].mean()))
+    sound = [(x.after[x.sound], x.piece.y[x.sound]) for x in residuals]
+    left_over, y = (np.concatenate(parts) for parts in zip(*sound, strict=True))
+    after = 100 * float(np.sqrt(np.mean(left_over**2)) / np.ptp(y))
+    before = result.before.overall
+    left = min(1.0, (after / before) ** 2)
+    taken = float(np.sqrt(max(before**2 - after**2, 0.0)))
+    told = ', '.join(f'{law} {error:.3g} %' for law, error in finding.errors.items())
+    sentence = (
+        f'The axes share modes with hysteresis inside their loop: {NAME} ({finding.law}). The '
+        f'error is {after:.3g} % of stroke, {before:.3g} % before. On multisines held out, in % '
+        f'of rms(y): {told}.'
+    )
+    return replace(
+        result,
+        verdict='named',
+        sentence=sentence,
+        effects=(FoundEffect(NAME, 'hidden', 1 - left, taken, {}),),
+        group=None,
+        gain=None,
+        set_in=False,
+        unexplained=Unexplained(left, after, 'structure that the shared modes do not account for'),
+        after=Errors(after, {}, {}),
+        held_out=None,
+        residuals=tuple(residuals),
+        promise=None,
+        weights={},
+    )

@@ -1,0 +1,233 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Modes that several axes share, with softening and hysteresis inside their loop.
+
+    x(k+1) = A x(k) + B u(k) + E p(k),    u = v - v0
+    y(k)   = C x(k) + D u(k) + H p(k) + y0
+    z(k)   = F x(k) + G u(k),             p = f(z): softening and plays
+
+Each signal z_j is a mixture of motion and voltage, such as the extension of an actuator.  The
+first `levels` signals soften: p_j = z_j (s - 1), where s is the rms of these signals with the time
+constant `memory`, 1 at the level of the fit.  The others are hysteretic: p_j is a sum of plays
+with few, shared thresholds.  p acts on the stage as one more voltage, so stiffness, damping and
+gain change with the motion.  With F = 0 the plays lie in front of the mechanics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.model.modes.kernels import Loop, Passage, trajectory
+from piezo_ident.model.modes.modal import Modal
+
+#: share of the slowest mode that is left when a run begins at rest (taste)
+SETTLED = 1e-3
+#: largest number of samples for it (taste: a second at the fastest rates)
+SETTLING = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class SharedModes:
+    """
+    The equations above.
+
+    Attributes
+    ----------
+    linear : Modal
+        A, B, C, D: the stage at the level s = 1 without its plays.
+    e, h, f, g : ndarray, shapes (n, q), (outputs, q), (q, n), (q, inputs)
+        How the q signals push, and what they are.
+    levels : int
+        Number of signals that soften; they come first.
+    mu : ndarray, shape (q, thresholds)
+        Weights of the plays, zero for signals that soften.
+    r : ndarray, shape (thresholds,)
+        Thresholds in units of z.
+    memory : float
+        Time constant of the level [samples].
+    range : tuple of float
+        Between these s softens the stage; beyond them the softening stays.
+    v0, y0 : ndarray, shapes (inputs,) and (outputs,)
+        Voltages [V] and displacements [m] about which the equations hold.
+    """
+
+    linear: Modal
+    e: Array
+    h: Array
+    f: Array
+    g: Array
+    levels: int
+    mu: Array
+    r: Array
+    memory: float
+    range: tuple[float, float]
+    v0: Array
+    y0: Array
+
+    @classmethod
+    def of(cls, linear: Modal) -> SharedModes:
+        """Make shared modes without signals, about zero."""
+        order, (outputs, inputs) = linear.order, linear.d.shape
+        return cls(
+            linear,
+            e=np.zeros((order, 0)),
+            h=np.zeros((outputs, 0)),
+            f=np.zeros((0, order)),
+            g=np.zeros((0, inputs)),
+            levels=0,
+            mu=np.zeros((0, 1)),
+            r=np.ones(1),
+            memory=300.0,
+            range=(0.3, 2.0),
+            v0=np.zeros(inputs),
+            y0=np.zeros(outputs),
+        )
+
+    @property
+    def signals(self) -> int:
+        """Number of signals z."""
+        return len(self.f)
+
+    @property
+    def loop(self) -> Loop:
+        """Arrays and numbers for the compiled loops."""
+        one, (low, high), kept = self.linear, self.range, math.exp(-1 / self.memory)
+        arrays = one.blocks, one.b, one.c, one.d, self.e, self.h, self.f, self.g, self.mu, self.r
+        blocks, b, c, d, e, h, f, g, mu, r = map(np.ascontiguousarray, arrays)
+        return Loop(blocks, b, c, d, e, h, f, g, mu, r, self.levels, low, high, kept)
+
+    def a_at(self, s: float) -> Array:
+        """Compute A at a level s, the plays at rest."""
+        soft = slice(0, self.levels)
+        s = float(np.clip(s, *self.range))
+        return np.asarray(self.linear.a + (s - 1) * self.e[:, soft] @ self.f[soft])
+
+    @property
+    def radius(self) -> float:
+        """Outermost pole over the range of levels, the plays at rest; below 1 it is stable."""
+        levels = (self.range[0], 1.0, self.range[1]) if self.levels else (1.0,)
+        return max(float(np.abs(np.linalg.eigvals(self.a_at(s))).max()) for s in levels)
+
+    def simulate(self, v: ArrayLike) -> Array:
+        """
+        Simulate the displacements under voltages in free run, from rest under the first sample.
+
+        Parameters
+        ----------
+        v : array_like, shape (n, inputs)
+            [V]
+
+        Returns
+        -------
+        ndarray, shape (n, outputs)
+            [m]
+
+        Raises
+        ------
+        ModelError
+            When the displacements grow without bound.
+        """
+        u = np.asarray(v, dtype=np.float64) - self.v0
+        if not len(u):
+            return np.zeros((0, len(self.y0)))
+        settled = np.vstack([np.repeat(u[:1], self.settling, axis=0), u])
+        return self.run(settled).y[self.settling :] + self.y0
+
+    def of_axes(self, v: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Simulate the axes in alphabetical order; voltages [V], displacements [m] by axis."""
+        order = sorted(v)
+        columns = np.column_stack([np.asarray(v[axis], dtype=np.float64) for axis in order])
+        return dict(zip(order, self.simulate(columns).T, strict=True))
+
+    @property
+    def settling(self) -> int:
+        """Samples after which the modes have settled."""
+        radius = min(self.radius, np.exp(math.log(SETTLED) / SETTLING))
+        return math.ceil(math.log(SETTLED) / math.log(radius)) if radius > 0 else 1
+
+    def steady(self, u: Array) -> Array:
+        """
+        Compute the steady motion under one period of voltages about `v0`, without its mean.
+
+        The period, shape (n, inputs), is run through once before.
+        """
+        y = self.run(np.concatenate([u, u])).y[len(u) :]
+        return np.asarray(y - y.mean(axis=0))
+
+    def run(self, u: Array) -> Passage:
+        """Run the equations under voltages u about `v0`, all states at zero before."""
+        u = np.ascontiguousarray(u, dtype=np.float64)
+        if u.ndim != 2 or u.shape[1] != self.linear.b.shape[1]:
+            raise DataError(
+                f'voltages of shape {u.shape} do not fit {self.linear.b.shape[1]} inputs; '
+                'give (samples, inputs)'
+            )
+        n, q, k = len(u), *self.mu.shape
+        run = Passage(
+            np.zeros((n, self.linear.order)),
+            np.zeros((n, q)),
+            np.zeros((n, q)),
+            np.zeros((n, q, k)),
+            np.zeros((n, q, k), np.uint8),
+            np.zeros(n),
+            np.zeros((n, len(self.h))),
+        )
+        done = trajectory(u, self.loop, run)
+        if done < n:
+            raise ModelError(f'the shared modes run away at sample {done} of {n}')
+        return run
+
+
+def modes_to_dict(modes: SharedModes) -> dict[str, Any]:
+    """Write shared modes as the plain data of a model file."""
+    data = {x.name: getattr(modes.linear, x.name) for x in fields(Modal)}
+    own = [x.name for x in fields(SharedModes) if x.name != 'linear']
+    return data | {name: getattr(modes, name) for name in own}
+
+
+def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
+    """Build the shared modes of a number of axes from a model file, or raise ModelError."""
+    try:
+        n, q, k = len(data['b']), len(data['f']), len(data['r'])
+        shapes = {
+            'blocks': (n // 2, 2, 2), 'b': (n, axes), 'c': (axes, n), 'd': (axes, axes),
+            'e': (n, q), 'h': (axes, q), 'f': (q, n), 'g': (q, axes), 'mu': (q, k), 'r': (k,),
+            'v0': (axes,), 'y0': (axes,), 'range': (2,), 'levels': (), 'memory': (),
+        }  # fmt: skip
+        # a list without rows does not tell how many columns it has
+        found = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
+        sound = all(np.isfinite(x).all() for x in found.values()) and found['memory'] > 0
+        levels, low, high = int(found['levels']), *map(float, found['range'])
+        if not sound or n % 2 or not 0 <= levels <= q or not 0 <= low <= 1 <= high:
+            raise ValueError('a number is out of range')
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelError(f'{name}: modes: {error!r}; see docs/two_axes.md') from None
+    linear = Modal(*(found[x.name] for x in fields(Modal)))
+    modes = SharedModes(
+        linear,
+        found['e'],
+        found['h'],
+        found['f'],
+        found['g'],
+        levels,
+        found['mu'],
+        found['r'],
+        float(found['memory']),
+        (low, high),
+        found['v0'],
+        found['y0'],
+    )
+    if not modes.radius < 1:
+        raise ModelError(
+            f'{name}: modes: unstable (pole at radius {modes.radius:.6g}); diagnose again'
+        )
+    return modes
