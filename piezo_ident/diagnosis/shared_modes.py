@@ -22,7 +22,8 @@ may fit a hysteresis of the voltages better than plays in front do.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 import warnings
 
 import numpy as np
@@ -62,19 +63,11 @@ ORDERS = (4, 6, 8, 12, 16, 20, 28, 36, 44, 52)
 STEPS, LAST_STEPS = 10, 6
 
 
-@dataclass(frozen=True, eq=False)
-class SharedModesFinding:
+class SharedModesFinding(NamedTuple):
     """
-    Modes that axes share, with hysteresis inside their loop.
+    Modes with hysteresis inside their loop, fitted to all multisines, and their law.
 
-    Attributes
-    ----------
-    modes : SharedModes
-        Fitted to all multisines.
-    law : str
-        One of `LAWS`.
-    errors : mapping of str to float
-        Error of each law and of ``chains`` on the multisines held out, % of rms(y).
+    `errors` are those of each law and of ``chains`` on the multisines held out, % of rms(y).
     """
 
     modes: SharedModes
@@ -102,7 +95,7 @@ def find_shared_modes(
     except (DataError, IdentificationError):
         # the lines do not tell the axes apart, or determine no order
         return None
-    return found and replace(found, modes=_placed(found.modes, records))
+    return found and found._replace(modes=_placed(found.modes, records))
 
 
 def _found(

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import overload
 
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError, expect, ModelError
+from piezo_ident.common.errors import DataError, expect
 from piezo_ident.model.free_run import compared, FreeRun
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import predict as predict_axis
@@ -100,7 +100,8 @@ def free_run(
         )
     kept = {axis: seen[axis] for axis in axes or model.axes}
     if model.modes is not None:
-        _refuse_band(interval)
+        if interval is not None:
+            model.require_chains('a band of the error')
         return EachAxis(_of_modes(model, model.modes.settling, record, kept))
     return EachAxis({axis: free_run(model.axes[axis], x, interval) for axis, x in kept.items()})
 
@@ -116,11 +117,6 @@ def _of_modes(
         axis: compared(model.axes[axis], without_faults(one), predicted[axis], late)
         for axis, one in seen.items()
     }
-
-
-def _refuse_band(interval: float | None) -> None:
-    if interval is not None:
-        raise ModelError('the model predicts by shared modes, and they carry no band')
 
 
 def predict(
@@ -140,8 +136,8 @@ def bands(
 ) -> dict[str, tuple[Array, ...]]:
     """Compute the half widths [m] of predictions from voltages alone, by axis."""
     models = models_of(model)
-    if isinstance(model, MultiAxisModel) and model.modes is not None:
-        _refuse_band(interval)
+    if isinstance(model, MultiAxisModel):
+        model.require_chains('a band of the error')
     seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
     return {k: half_widths(models[k], seen[k], x, interval) for k, x in predicted.items()}
 

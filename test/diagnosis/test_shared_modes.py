@@ -125,16 +125,12 @@ def test_the_file_of_shared_modes_reads_back_bit_by_bit(tmp_path):
         lambda model: pi.invert(model, {'y': np.zeros(100)}),
         pi.export_c,
         lambda model: pi.diagnose(model, measured()),
+        lambda model: pi.free_run(model, measured(), 0.9),
     ],
 )
 def test_verbs_that_run_chains_alone_refuse_shared_modes(verb):
     with pytest.raises(ModelError, match='modes that the axes share'):
         verb(diagnosed().model)
-
-
-def test_shared_modes_carry_no_band():
-    with pytest.raises(ModelError, match='no band'):
-        pi.free_run(diagnosed().model, measured(), 0.9)
 
 
 def test_a_linear_stage_shares_no_loop():

@@ -68,14 +68,7 @@ def frequency_response(
     """
     Fit the response at each excited line by a local polynomial over its neighbours.
 
-    Parameters
-    ----------
-    records : sequence of PeriodicRecord
-        Of one rate and one number of samples.
-    half_width : int
-        Neighbours on either side.
-    degree : int
-        Degree of the polynomial.
+    The polynomial has a degree, and `half_width` neighbours on either side.
     """
     lines = excited_lines(records)
     u = np.array([np.fft.rfft(r.mean_u, axis=0)[lines] for r in records])
