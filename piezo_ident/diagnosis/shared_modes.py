@@ -86,12 +86,13 @@ def find_shared_modes(
     """
     if axes_of(records) != tuple(sorted(chains.axes)):
         return None
-    every, v0 = periods_of(records)
-    parts = groups(every).values()
-    if len(parts) < 2 or min(map(len, parts)) < 2 or max(map(likeness, parts)) > ONE_SIGNAL:
-        return None
     try:
-        found = _found(chains, every, v0, progress)
+        every, v0 = periods_of(records)
+        parts = groups(every).values()
+        if len(parts) < 2 or min(map(len, parts)) < 2 or len(v0) != len(chains.axes):
+            return None
+        alike = max(map(likeness, parts)) > ONE_SIGNAL
+        found = None if alike else _found(chains, every, v0, progress)
     except (DataError, IdentificationError):
         # the lines do not tell the axes apart, or determine no order
         return None

@@ -166,9 +166,9 @@ def periods_of(records: Sequence[Record]) -> tuple[tuple[PeriodicRecord, ...], A
         Mean of the voltages [V].
     """
     records = [without_faults(record) for record in records]
-    every, found = Axes.of_records(records), []
-    named = [(record.name, piece) for record in records for piece in record]
-    for axes, (name, piece) in zip(every, named, strict=True):
+    found, rate = [], records[0].pieces[0].sample_rate
+    for name, piece in ((record.name, piece) for record in records for piece in record):
+        axes = Axes.of(piece)
         parts = [(s.label, slice(s.start, s.stop)) for s in piece.segments]
         for label, part in parts or [(name, slice(piece.n))]:
             count = _periods(axes.inputs[part])
@@ -181,7 +181,7 @@ def periods_of(records: Sequence[Record]) -> tuple[tuple[PeriodicRecord, ...], A
     size = Counter(u.shape[1] for _, u, _ in found).most_common(1)[0][0]
     found = [(name, u, y) for name, u, y in found if u.shape[1] == size]
     v0 = np.mean([u.mean(axis=(0, 1)) for _, u, _ in found], axis=0)
-    rate, sizes = every[0].sample_rate, dict[str, float]()
+    sizes = dict[str, float]()
     periods = [
         PeriodicRecord(name, re.sub(r'-?\d+$', '', name), rate, u - v0, y) for name, u, y in found
     ]

@@ -13,9 +13,7 @@ The compiled loops of a stage with softening and plays inside its loop, and its 
 with F_r the play of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
 
 Sensitivities run beside the trajectory, in single precision, some parameters at once so that they
-stay in the cache: of a play the derivative is that of z where z drives it and stands where it
-rests.  Both loops share one file because a compiled loop is kept on disk until its own file
-changes.
+stay in the cache: the derivative of a play is that of z where z drives it, and stands otherwise.
 """
 
 from __future__ import annotations

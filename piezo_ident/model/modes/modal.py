@@ -6,8 +6,7 @@ A linear stage of several axes in modal coordinates.
 
     x(k+1) = A x(k) + B u(k),    y(k) = C x(k) + D u(k)
 
-A is block diagonal, [[a, b], [-b, a]] for a mode of the poles a +- ib, diag(a, b) for two real
-poles, so a stage of 44 states takes 88 products a sample for A, and a pole moves without the rest.
+A has the blocks [[a, b], [-b, a]] for poles a +- ib, and diag(a, b) for two real poles.
 """
 
 from __future__ import annotations
@@ -96,10 +95,9 @@ class Modal:
 
 def narrowest(samples: int) -> float:
     """
-    Return how far from the origin the poles of a mode may lie that a period resolves.
+    Compute the largest radius of a mode that a period resolves.
 
-    A resonance that is narrower than the distance of two lines shows in one of them at most: there
-    it makes up for noise and distortion, and rings on under other motion.
+    A narrower resonance shows in one line at most, where it fits noise.
     """
     return float(np.exp(-np.pi / samples))
 
