@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A stage lacks something that nobody tells the identifier: it finds out on the running graph.
+The hysteresis of a stage depends on the rate, and nobody tells the identifier: it finds out.
 
-Two stages in two namespaces, one that creeps, one whose hysteresis depends on the rate, are
-identified and then diagnosed from nothing: what data that takes, the identifier asks for.
+The stage is identified and then diagnosed from nothing: what data that takes, the identifier asks
+for on the running graph.
 """
 
 import json
-import time
 
 from course import paper, SETTINGS
 import numpy as np
@@ -25,7 +24,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load, model_from_dict
 import yaml
 
-TRUTHS = ('creep', 'rate_dependent_hysteresis')
+TRUTH = 'rate_dependent_hysteresis'
 #: a quarter of the usual rate is enough for what is told apart here
 FS = 5000.0
 LEARN = identification_program(
@@ -71,63 +70,44 @@ IDENTIFIER = {
     'excitation_limit': 5.0,
     'nice': 0,
 }
-#: creep that ends within the second at rest between two programs: a new model starts from rest,
-#: and what creeps on from earlier motion is not in its records
-CREEP = {'gain': [0.012, 0.012, 0.012], 'time_constant': [0.03, 0.1, 0.3]}
-#: two diagnoses at once, on a machine that does other things [s]
+#: a diagnosis on a machine that does other things [s]
 LONG = 240.0
-
-
-def stage_with(effect, folder):
-    """Write a stage that has one of the effects of the shipped one, and return its path."""
-    data = yaml.safe_load(find_config('effects', 'stage').read_text())
-    data['effects'] = [e for e in data['effects'] if e['name'] == effect]
-    if effect == 'creep':
-        data['effects'][0]['parameters'] = CREEP
-    data |= {'sample_rate': FS, 'dynamics': {'a': [-1.2, 0.5], 'b': [0.13, 0.06]}}
-    path = folder / f'{effect}.yaml'
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
 
 
 @pytest.fixture(scope='module')
 def lab(tmp_path_factory):
-    """Return a graph with both stages, the identifiers and all that they need."""
-    folder = tmp_path_factory.mktemp('stages')
+    """Return a graph with the stage, the identifier and all that they need."""
+    data = yaml.safe_load(find_config('effects', 'stage').read_text())
+    data['effects'] = [e for e in data['effects'] if e['name'] == TRUTH]
+    data |= {'sample_rate': FS, 'dynamics': {'a': [-1.2, 0.5], 'b': [0.13, 0.06]}}
+    path = tmp_path_factory.mktemp('stage') / 'stage.yaml'
+    path.write_text(yaml.safe_dump(data))
     excitation = {'sample_rate': FS, 'rate_factor': 4.0, 'program': LEARN, 'subscribers': 3}
     with Graph() as g:
         g.start_all(
-            *(
-                (node, params, truth)
-                for truth in TRUTHS
-                for node, params in (
-                    ('stage', {'stage': stage_with(truth, folder), 'seed': 3}),
-                    ('excitation', excitation),
-                    ('identifier', IDENTIFIER),
-                    ('model', {}),
-                )
-            )
+            ('stage', {'stage': str(path), 'seed': 3}),
+            ('excitation', excitation),
+            ('identifier', IDENTIFIER),
+            ('model',),
         )
-        for truth in TRUTHS:
-            g.matched(f'{truth}/residual')
-            g.texts(f'{truth}/model')
-            g.texts(f'{truth}/report')
+        g.matched('residual')
+        g.texts('model')
+        g.texts('report')
         yield g
 
 
-def begin(g, truth, service):
-    """Call a service of an identifier, and return how much of its status was heard before."""
-    seen = len(g.statuses(f'{truth}/identifier'))
-    ok, message = g.call(f'{truth}/identifier/{service}')
+def begin(g, service):
+    """Call a service of the identifier, and return how much of its status was heard before."""
+    seen = len(g.statuses('identifier'))
+    ok, message = g.call(f'identifier/{service}')
     assert ok, message
     return seen
 
 
-def end_of(g, truth, seen):
-    """Wait for the end of what an identifier does, and return all that it said until then."""
-    name = f'{truth}/identifier'
-    last = g.until(name, *ENDS, since=seen, timeout=LONG)
-    said = g.statuses(name)[seen:]
+def end_of(g, seen):
+    """Wait for the end of what the identifier does, and return all that it said until then."""
+    last = g.until('identifier', *ENDS, since=seen, timeout=LONG)
+    said = g.statuses('identifier')[seen:]
     return said[: said.index(last) + 1]
 
 
@@ -137,115 +117,96 @@ def rms(blocks):
     return 100.0 * float(np.sqrt(np.mean(e**2))) / 71e-6
 
 
-def play(g, truth, program):
+def play(g, program):
     """Have a program played while nobody asks for it, and return its residual."""
-    residual = g.collect(f'{truth}/residual')
+    residual = g.collect('residual')
     samples = len(residual)
-    assert g.set(f'{truth}/excitation', 'program', program) == (True, '')
-    assert g.finish(f'{truth}/excitation/start')['state'] == 'done'
+    assert g.set('excitation', 'program', program) == (True, '')
+    assert g.finish('excitation/start')['state'] == 'done'
     end = parse_program(program).build(FS).duration
     g.wait(lambda: abs(residual[-1].t[-1] - end) < 2 / FS, 'its last residual')
     return residual[samples:]
 
 
 @pytest.fixture(scope='module')
-def stories(lab):
-    """Return what each identifier said from ~/diagnose on; both were only told to ~/run."""
-    for truth in TRUTHS:
-        ok, reason = lab.call(f'{truth}/identifier/diagnose')
-        assert not ok and 'no model to diagnose' in reason
-    for truth, seen in [(truth, begin(lab, truth, 'run')) for truth in TRUTHS]:
-        assert end_of(lab, truth, seen)[-1]['state'] == 'done'
-        lab.wait(lambda truth=truth: lab.texts(f'{truth}/model'), 'the model')
-        taken = lambda truth=truth: lab.status(f'{truth}/model')['state'] == 'predicting'  # noqa: E731
-        lab.wait(taken, 'the model to be taken over')
-    begun = time.monotonic()
-    told = [(truth, begin(lab, truth, 'diagnose')) for truth in TRUTHS]
-    found = {truth: end_of(lab, truth, seen) for truth, seen in told}
-    print(f'both diagnoses: {time.monotonic() - begun:.0f} s')
-    return found
+def story(lab):
+    """Return what the identifier said from ~/diagnose on; it was only told to ~/run."""
+    ok, reason = lab.call('identifier/diagnose')
+    assert not ok and 'no model to diagnose' in reason
+    assert end_of(lab, begin(lab, 'run'))[-1]['state'] == 'done'
+    lab.wait(lambda: lab.texts('model'), 'the model')
+    lab.wait(lambda: lab.status('model')['state'] == 'predicting', 'the model to be taken over')
+    return end_of(lab, begin(lab, 'diagnose'))
 
 
-@pytest.mark.parametrize('truth', TRUTHS)
-def test_it_asks_for_what_it_lacks_and_tells_creep_from_rate_dependence(lab, stories, truth):
-    said = stories[truth]
-    assert said[-1]['state'] == 'done', said[-1]
-    exciting = [s['text'] for s in said if s['state'] == 'exciting']
+def test_it_asks_for_what_it_lacks_and_names_the_rate_dependence(lab, story):
+    assert story[-1]['state'] == 'done', story[-1]
+    exciting = [s['text'] for s in story if s['state'] == 'exciting']
     # how much was captured follows
     asked = list(dict.fromkeys(': '.join(m.split(': ')[:2]) for m in exciting))
-    print(truth, asked, said[-1]['text'])
     assert [a.split(':')[0] for a in asked] == ['asking for sweeps', 'asking for holds']
-    assert truth in asked[1] and 'hold' in asked[1]
-    assert {s['state'] for s in said} == {'exciting', 'diagnosing', 'done'}
-    report = json.loads(lab.texts(f'{truth}/report')[-1])
+    assert TRUTH in asked[1] and 'hold' in asked[1]
+    assert {s['state'] for s in story} == {'exciting', 'diagnosing', 'done'}
+    report = json.loads(lab.texts('report')[-1])
     assert report['records'] == ['capture 1', 'capture 2']
-    assert (report['verdict'], [e['name'] for e in report['effects']]) == ('named', [truth])
+    assert (report['verdict'], [e['name'] for e in report['effects']]) == ('named', [TRUTH])
     count = len(report['warnings']) + len(report['data_faults'])
     caveats = f'; {count} warning{"s" * (count > 1)} in the report' if count else ''
-    assert said[-1]['text'] == report['sentence'].rstrip('.') + caveats
+    assert story[-1]['text'] == report['sentence'].rstrip('.') + caveats
     error = report['error']
     assert error['after']['overall'] < 0.3 * error['before']['overall']
 
 
-@pytest.mark.parametrize('truth', TRUTHS)
-def test_the_residual_falls_when_the_refined_model_is_taken_over(lab, stories, truth):
-    models = lab.texts(f'{truth}/model')
+def test_the_residual_falls_when_the_refined_model_is_taken_over(lab, story):
+    models = lab.texts('model')
     assert len(models) == 2
-    first, refined = (model_from_dict(parse_yaml(text, truth)) for text in models)
-    assert not first.effects and [e.name for e in refined.effects] == [truth]
-    lab.wait(lambda: lab.status(f'{truth}/model')['models'] == '2', 'the refined model')
-    residual = lab.collect(f'{truth}/residual')
+    first, refined = (model_from_dict(parse_yaml(text, TRUTH)) for text in models)
+    assert not first.effects and [e.name for e in refined.effects] == [TRUTH]
+    lab.wait(lambda: lab.status('model')['models'] == '2', 'the refined model')
+    residual = lab.collect('residual')
     starts = [i for i, b in enumerate(residual) if b.t[0] == 0.0]
     # sweeps and holds were played with the first model
     before = rms(residual[starts[-2] : starts[-1]])
-    after = rms(play(lab, truth, SWEEPS))
-    print(f'{truth}: residual {before:.3f} -> {after:.3f} % of stroke')
+    after = rms(play(lab, SWEEPS))
+    print(f'residual {before:.3f} -> {after:.3f} % of stroke')
     assert after < 0.3 * before
 
 
-def test_save_writes_both_reports(lab, stories, tmp_path):
-    truth = TRUTHS[1]
-    assert lab.set(f'{truth}/identifier', 'output', str(tmp_path / 'out'))[0]
-    last = end_of(lab, truth, begin(lab, truth, 'save'))[-1]
+def test_save_writes_both_reports(lab, story, tmp_path):
+    assert lab.set('identifier', 'output', str(tmp_path / 'out'))[0]
+    last = end_of(lab, begin(lab, 'save'))[-1]
     assert last['state'] == 'done' and last['text'].count('report.html') == 2, last
     folder = tmp_path / 'out'
     assert not load(folder / 'model.yaml').effects
-    assert [e.name for e in load(folder / 'diagnosis/model.yaml').effects] == [truth]
+    assert [e.name for e in load(folder / 'diagnosis/model.yaml').effects] == [TRUTH]
     written = json.loads((folder / 'diagnosis/diagnosis.json').read_text())
-    assert written == json.loads(lab.texts(f'{truth}/report')[-1])
+    assert written == json.loads(lab.texts('report')[-1])
     assert (folder / 'diagnosis/report.html').is_file()
 
 
-def test_cancel_stops_the_work_and_changes_nothing(lab, stories):
-    truth = TRUTHS[0]
-    node = f'{truth}/identifier'
-    models, reports = len(lab.texts(f'{truth}/model')), len(lab.texts(f'{truth}/report'))
-    seen = begin(lab, truth, 'diagnose')
-    lab.wait(lambda: lab.status(node)['text'] == 'candidates', 'the candidates')
-    ok, reason = lab.call(f'{node}/diagnose')
+def test_cancel_stops_the_work_and_changes_nothing(lab, story):
+    models, reports = len(lab.texts('model')), len(lab.texts('report'))
+    seen = begin(lab, 'diagnose')
+    lab.wait(lambda: lab.status('identifier')['text'] == 'candidates', 'the candidates')
+    ok, reason = lab.call('identifier/diagnose')
     assert not ok and 'busy: diagnosis' in reason
-    asked = time.monotonic()
-    assert lab.call(f'{node}/cancel')[0]
-    last = end_of(lab, truth, seen)[-1]
-    print(f'cancelled in {time.monotonic() - asked:.2f} s')
+    assert lab.call('identifier/cancel')[0]
+    last = end_of(lab, seen)[-1]
     assert last['state'] == 'cancelled' and 'nothing was changed' in last['text']
-    assert len(lab.texts(f'{truth}/model')) == models
-    assert len(lab.texts(f'{truth}/report')) == reports
+    assert (len(lab.texts('model')), len(lab.texts('report'))) == (models, reports)
 
 
-def test_cancel_ramps_what_was_asked_for_to_rest(lab, stories):
-    truth = TRUTHS[0]
-    node, drive = f'{truth}/identifier', f'{truth}/excitation'
-    assert lab.call(f'{node}/clear')[0]
-    assert lab.set(drive, 'rate_factor', 1.0) == (True, '')
-    begin(lab, truth, 'diagnose')
-    lab.wait(lambda: lab.status(drive).get('segment') == 'sine:1Hz-first', 'the sine')
-    assert lab.call(f'{node}/cancel')[0]
-    lab.wait(lambda: lab.status(node)['state'] == 'cancelled', 'cancelled')
-    lab.wait(lambda: lab.status(drive)['state'] == 'stopped', 'stopped')
-    assert lab.call(f'{node}/clear')[0]
-    assert lab.set(node, 'requests', 0) == (True, '')
-    ok, reason = lab.call(f'{node}/diagnose')
+def test_cancel_ramps_what_was_asked_for_to_rest(lab, story):
+    assert lab.call('identifier/clear')[0]
+    assert lab.set('excitation', 'rate_factor', 1.0) == (True, '')
+    begin(lab, 'diagnose')
+    lab.wait(lambda: lab.status('excitation').get('segment') == 'sine:1Hz-first', 'the sine')
+    assert lab.call('identifier/cancel')[0]
+    lab.wait(lambda: lab.status('identifier')['state'] == 'cancelled', 'cancelled')
+    lab.wait(lambda: lab.status('excitation')['state'] == 'stopped', 'stopped')
+    assert lab.call('identifier/clear')[0]
+    assert lab.set('identifier', 'requests', 0) == (True, '')
+    ok, reason = lab.call('identifier/diagnose')
     assert not ok and 'nothing was captured' in reason and '0 requests' in reason
 
 
