@@ -118,15 +118,6 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     lab.wait(lambda: len(lab.texts('model')) == models + 1, 'the model')
 
 
-def test_a_stage_that_refuses_the_rate_ends_the_run():
-    with Graph() as g:
-        g.start_all(('excitation', {'sample_rate': 10_000.0}), ('stage',), ('identifier', QUICK))
-        text = ended(g, run(g, 'identification'), 'failed')
-        assert 'none at all; it says: a block is refused: it is sampled at 10000 Hz' in text
-        g.wait(lambda: g.status('excitation')['state'] == 'stopped', 'the excitation to stop')
-        assert float(g.status('excitation')['progress']) < 60.0
-
-
 def test_a_stage_that_stops_answering_in_a_run(lab):
     models, stage = len(lab.texts('model')), lab.handle('stage')
     assert lab.set('identifier', 'excitation_limit', 2.0)[0]
@@ -165,7 +156,7 @@ def test_an_excitation_that_is_killed_before_its_first_block(lab):
         assert lab.set('identifier', 'excitation_limit', 20.0)[0]
 
 
-def test_a_stage_that_answers_no_block(graph):
+def test_a_stage_that_refuses_the_rate_ends_the_run(graph):
     half = {'sample_rate': 10_000.0, 'block_size': 500, 'subscribers': 2}
     graph.start_all(
         ('excitation', half, 'odd'),
@@ -178,6 +169,10 @@ def test_a_stage_that_answers_no_block(graph):
     graph.wait(lambda: graph.status('odd/identifier')['state'] == 'failed', 'the end of the run')
     reason = graph.status('odd/identifier')['text']
     assert 'no displacement from the stage for 2 s, none at all' in reason
+    assert 'it says: a block is refused: it is sampled at 10000 Hz' in reason
+    drive = lambda: graph.status('odd/excitation')  # noqa: E731
+    graph.wait(lambda: drive()['state'] == 'stopped', 'the excitation to stop')
+    assert float(drive()['progress']) < 60.0
     assert graph.status('odd/stage')['level'] == '1'
 
 
