@@ -40,7 +40,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from diagnostic_msgs.msg import DiagnosticArray
 from nursery import can_copy
 from observer import ENDS, Observer
-from processes import alive, crowd, Handle, in_time, listens, take_domain
+from processes import alive, crowd, Handle, in_time, LIMIT, listens, take_domain
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -152,6 +152,13 @@ class Graph(Observer):
         else:
             handle.is_ended = True
         return handle
+
+    def refused(self, executable: str, params: Mapping[str, Any]) -> str:
+        """Start a node whose parameters have to end it with exit code 2, and return its log."""
+        handle = self._begin(executable, params, is_copy=can_copy())
+        handle.is_ended = True
+        assert handle.process.wait(LIMIT) == 2, handle.log
+        return handle.log
 
     def _begin(
         self,

@@ -10,7 +10,6 @@ from graph import Graph, Handle
 
 def test_what_cannot_be_taken_costs_one_line():
     with Graph() as g:
-        bad = g.start('identifier', {'channels': ['bad name']}, wait=False)
         first = g.start('recorder', {'flash': 0.2, 'use_sim_time': False})
         command = first.command
         lost = Handle(
@@ -21,9 +20,8 @@ def test_what_cannot_be_taken_costs_one_line():
         )
         g.handles += [lost, twin]
         lost.is_ended = True
-        for handle, said in ((bad, "channels: 'bad name'"), (lost, 'params file')):
-            assert handle.process.wait(60) == 2
-            assert said in handle.log and 'Traceback' not in handle.log
+        assert lost.process.wait(60) == 2
+        assert 'params file' in lost.log and 'Traceback' not in lost.log
         g.wait(lambda: 'did you mean flush?' in first.log, 'the misspelt parameter')
         g.wait(lambda: '--rate 3 is passed over' in twin.log, 'the arguments')
         for handle in (first, twin):
@@ -32,3 +30,20 @@ def test_what_cannot_be_taken_costs_one_line():
         for handle in (first, twin):
             handle.send(signal.SIGINT)
             assert handle.process.wait(60) == 0
+
+
+def test_bad_parameters_at_the_start_end_a_node_with_the_reason(tmp_path):
+    (tmp_path / 'bad.yaml').write_text('sample_rate: 20000\n')
+    with Graph() as g:
+        for node, name, value, reason in (
+            ('excitation', 'program', 'nonsense', 'no such program'),
+            ('excitation', 'voltage_high', 5.0, 'outside the limits'),
+            ('excitation', 'axes', ['um'], "axes: 'um' cannot be the name of an axis"),
+            ('stage', 'stage', 'nonsense', 'no such stage'),
+            ('stage', 'rest', 11.0, 'rest = 11 V lies outside'),
+            ('identifier', 'channels', ['bad name'], "channels: 'bad name'"),
+            ('model', 'model', str(tmp_path / 'bad.yaml'), 'piezo_ident: error: model:'),
+            ('recorder', 'topics', ['volt age'], 'is no name of a topic'),
+        ):
+            log = g.refused(node, {name: value})
+            assert reason in log and 'Traceback' not in log, log

@@ -207,10 +207,3 @@ def test_an_axis_that_nobody_drives_rests(lab):
     lab.wait(lambda: lab.diagnostics('stage')['missing'] == '200', 'what is missing')
     held = [block for block in applied if block.segment == 'both']
     assert held[0].values[-1] > 9.8 and (held[-1].values == held[0].values[-1]).all()
-
-
-def test_a_unit_is_no_name_of_an_axis():
-    with Graph() as g:
-        handle = g.start('excitation', {'axes': ['um']}, wait=False)
-        assert handle.process.wait(60) == 2
-        assert "axes: 'um' cannot be the name of an axis" in handle.log
