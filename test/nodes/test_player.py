@@ -64,22 +64,13 @@ def same(got: list[Samples], want: list[Samples]) -> bool:
 
 
 @pytest.fixture(scope='module')
-def lab(tmp_path_factory):
+def lab():
     """Return a graph with players in namespaces of their own."""
-    recorder = {
-        'output': str(tmp_path_factory.mktemp('again') / 'bag'),
-        # no /diagnostics, which come all the time: the messages are counted
-        'topics': ['voltage', 'displacement'],
-        'autostart': True,
-    }
     with Graph() as g:
         g.start_all(
             ('player', {}, 'b'),
             ('player', {'wait_limit': 0.3}, 'c'),
-            # the recorder, and who looks
-            ('player', {'subscribers': 2}, 'd'),
             ('player', {}, 'e'),
-            ('recorder', recorder, 'd'),
         )
         yield g
 
@@ -168,24 +159,6 @@ def test_refusals_and_waiting(lab, tmp_path):
     lab.until('c/player', 'done', since=since)
     lab.wait(lambda: len(voltage) >= 20 and len(displacement) >= 20, 'all blocks')
     assert len(voltage) == len(displacement) == 20
-
-
-def test_record_and_replay(lab, tmp_path):
-    bag(tmp_path / 'bag', 100)
-    first, second = lab.collect('/d/voltage'), lab.collect('/d/displacement')
-    lab.until('d/recorder', 'recording')
-    assert lab.set('d/player', 'bag', str(tmp_path / 'bag'))[0]
-    assert lab.finish('d/player/start')['state'] == 'done'
-    lab.wait(lambda: lab.status('d/recorder')['messages'] == '200', 'all in the bag')
-    assert lab.finish('d/recorder/stop')['state'] == 'done'
-    lab.wait(lambda: len(first) >= 100 and len(second) >= 100, 'all blocks')
-    assert lab.set('d/player', 'subscribers', 1)[0]
-    assert lab.set('d/player', 'bag', lab.status('d/recorder')['path'])[0]
-    assert lab.set('d/player', 'rate', 2.0)[0]
-    assert lab.call('d/player/start')[0]
-    lab.wait(lambda: len(first) >= 200 and len(second) >= 200, 'all blocks again')
-    assert same(second[100:], [pair(k)[1] for k in range(100)])
-    assert same(first[100:], first[:100])
 
 
 def test_a_log_clock_that_was_set_back_does_not_mix_the_blocks(lab, tmp_path):

@@ -5,12 +5,10 @@
 
 import json
 import re
-import signal
-import time
 
 from course import block, HIGH, model_of, numbers, PROGRAM, QUICK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph import Graph, in_time
+from graph import Graph
 from graph_page import DIAGNOSTICS, OPERATOR, rights, ROOT, SERVICES, STATES, TOPICS
 from layouts import (
     found_by_foxglove,
@@ -365,19 +363,7 @@ def test_what_is_no_parameter_is_refused(whole):
     assert whole.set('excitation', 'rate_facter', 1.0) == (False, reason)
 
 
-def test_a_bare_off_is_the_choice_off():
-    # YAML reads it as false
-    with Graph() as g:
-        g.start_all(('model', {'adapt': False}))
-        assert g.get('model', 'adapt') == 'off'
-        assert g.set('model', 'adapt', 'gain') == (True, '')
-        assert g.set('model', 'adapt', False) == (True, '')
-        assert g.get('model', 'adapt') == 'off'
-        taken, reason = g.set('model', 'adapt', True)
-        assert not taken and 'hysteresis' in reason
-
-
-def test_every_yaml_file_loads_into_its_running_node():
+def test_every_yaml_file_loads_into_its_running_node_and_a_bare_off_is_a_choice():
     # as ros2 param load has it: all keys, whether they can be changed or not
     with Graph() as g:
         files = {node: ROOT / f'config/{node}.yaml' for node in NODES}
@@ -385,7 +371,15 @@ def test_every_yaml_file_loads_into_its_running_node():
             node: next(iter(yaml.safe_load(files[node].read_text()).values()))['ros__parameters']
             for node in NODES
         }
+        # YAML reads a bare off as false
+        values['model']['adapt'] = False
         g.start_all(*((node, values[node]) for node in NODES))
+        assert g.get('model', 'adapt') == 'off'
+        for wanted, name in (('gain', 'gain'), (False, 'off')):
+            assert g.set('model', 'adapt', wanted) == (True, '')
+            assert g.get('model', 'adapt') == name
+        taken, reason = g.set('model', 'adapt', True)
+        assert not taken and 'hysteresis' in reason
         for node in NODES:
             found = parameter_dict_from_yaml_file(str(files[node]), True)
             for name, message in found.items():
@@ -393,22 +387,3 @@ def test_every_yaml_file_loads_into_its_running_node():
                 assert g.set(node, name, value) == (True, ''), (node, name, value)
         taken, reason = g.set('identifier', 'nice', 6)
         assert not taken and 'read-only' in reason
-
-
-@pytest.mark.timed
-def test_a_signal_ends_what_is_at_rest():
-    with Graph() as g:
-        g.start_all(*((node,) for node in NODES))
-        assert g.set('excitation', 'program', HIGH)[0]
-        assert g.call('excitation/start')[0]
-        g.until('excitation', 'running')
-        assert g.finish('excitation/stop', 'stopped')['state'] == 'stopped'
-        g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
-        begin = time.monotonic()
-        for node in NODES:
-            g.handle(node).send(signal.SIGTERM)
-        for node in NODES:
-            handle = g.handle(node)
-            assert handle.process.wait(60) == 0, (node, handle.log)
-            assert not handle.complaints, node
-        in_time(time.monotonic() - begin, 2.0, 'the end of all nodes at rest')
