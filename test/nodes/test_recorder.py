@@ -218,7 +218,7 @@ def test_flush_is_how_long_a_message_waits_and_a_lost_folder_is_said(tmp_path):
                 assert g.set('recorder', 'flush', flush) == (True, '')
                 start(g)
                 seen, sent, begin = len(g.statuses('recorder')), len(source.sent), time.monotonic()
-                g.wait(lambda sent=sent: len(source.sent) > sent + 400, '2 s of blocks')
+                g.wait(lambda sent=sent: len(source.sent) > sent + 200, '1 s of blocks')
                 sizes = {s['bytes'] for s in g.statuses('recorder')[seen:]}
                 # a second, however long it was looked at
                 flushes[flush] = len(sizes) / (time.monotonic() - begin)
@@ -246,7 +246,7 @@ def killed(tmp_path, storage, capsys):
         recorder = g.start('recorder', {'output': str(tmp_path / 'bag'), 'storage': storage})
         start(g)
         with source:
-            g.wait(lambda: len(source.sent) > 500, '2.5 s of blocks')
+            g.wait(lambda: len(source.sent) > 300, '1.5 s of blocks')
             before = len(source.sent)
             recorder.kill()
             after = len(source.sent)
@@ -318,10 +318,3 @@ def test_other_topics_types_and_qos(tmp_path):
         assert types['/else/pose'] == 'sensor_msgs/msg/JointState'
         (qos,) = next(c for c in bag.connections if c.topic == '/voltage').ext.offered_qos_profiles
         assert qos.reliability.name == 'BEST_EFFORT'
-
-
-def test_bad_topic_names_end_the_node(tmp_path):
-    with Graph() as g:
-        recorder = g.start('recorder', {'topics': ['volt age']}, wait=False)
-        assert recorder.process.wait(60) == 2
-        assert 'is no name of a topic' in recorder.log
