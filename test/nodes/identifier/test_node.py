@@ -262,26 +262,9 @@ def other_quantity(block):
     return Samples(block.t, block.values, block.segment, 'voltage')
 
 
-def test_small_faults_are_said_in_model_and_report(empty, blocks):
-    k = first_of([v for v, _ in blocks], 'noise') + 10
-    (v0, y0), (v1, y1) = blocks[k : k + 2]
-    short = Samples(y1.t[:970], y1.values[:970], y1.segment, y1.quantity)
-    again = blocks[k + 2]
-    feed(empty, [*blocks[:k], (v0, nan(y0)), (v1, short), again, again, *blocks[k + 3 :]])
-    end = made(empty)
-    assert end['level'] == '1' and 'warnings in the report' in end['text']
-    report = json.loads(empty.texts('report')[-1])
-    assert {'not_finite', 'gap', 'unmatched', 'repeated_rows'} <= {
-        f['name'] for f in report['data_faults']
-    }
-    model = model_of(empty.texts('model')[-1])
-    assert any('not_finite' in w for w in model.identification['warnings'])
-
-
 @pytest.mark.parametrize(
     ('fault', 'reason'),
     [
-        ('dropped', 'of the noise segments are missing'),
         ('swapped', 'time is unsorted'),
         ('nan', 'NaN or infinite'),
         ('malformed', 'of the noise segments are missing'),
@@ -292,10 +275,7 @@ def test_small_faults_are_said_in_model_and_report(empty, blocks):
 def test_a_fault_that_spoils_the_data_is_a_failure_with_its_reason(empty, blocks, fault, reason):
     k = first_of([v for v, _ in blocks], 'noise') + 5
     pairs = list(blocks)
-    if fault == 'dropped':
-        for i in range(3):
-            pairs[k + i] = (pairs[k + i][0], None)
-    elif fault == 'swapped':
+    if fault == 'swapped':
         pairs[k], pairs[k + 1] = pairs[k + 1], pairs[k]
     elif fault == 'nan':
         for i in range(k, k + 10):

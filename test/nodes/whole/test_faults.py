@@ -138,6 +138,7 @@ def test_what_is_wrong_with_the_stream_is_said_and_makes_no_bad_model(rig, name)
     report, model = json.loads(rig.reports[-1]), model_of(rig.models[-1])
     assert {f['name'] for f in report['data_faults']} == fault.warnings
     assert end['level'] == ('1' if fault.warnings else '0')
+    assert ('in the report' in end['text']) == bool(fault.warnings)
     for warning in fault.warnings:
         assert any(warning in w for w in model.identification['warnings'])
     assert is_good(rig.models[-1])
