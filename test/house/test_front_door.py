@@ -105,7 +105,7 @@ def results():
     v = 5 - 5 * np.cos(2 * np.pi * 50 * np.arange(4000) / 20e3)
     record = pi.Record.from_arrays(v, model.simulate(v), sample_rate=20e3)
     one = {
-        'identify': pi.identify(record),
+        'identify': pi.identify(record, pi.Settings(thresholds=4, delay=3, order=(1, 1))),
         'free_run': pi.free_run(model, record),
         'diagnose': pi.diagnose(model, record, pi.DiagnosisSettings(effects=('saturation',))),
         'invert': pi.invert(model, np.linspace(20e-6, 30e-6, 500)),

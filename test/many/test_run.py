@@ -152,7 +152,8 @@ def test_diagnosis_with_a_model_for_each(tmp_path, in_this_process):
     for path in paths:
         pi.write(record, path)
     slow_model().save(tmp_path / 'given/a.yaml')
-    first, second = run_many(paths, tmp_path / 'out', Diagnose(tmp_path / 'given'), jobs=1)
+    task = Diagnose(tmp_path / 'given', pi.DiagnosisSettings(effects=('creep',)))
+    first, second = run_many(paths, tmp_path / 'out', task, jobs=1)
     assert first.is_good, first.reason
     assert first.values['verdict'] and first.values['model'] == 'a.yaml'
     assert 'b.yaml' in second.reason
