@@ -60,7 +60,10 @@ class Pull:
 
 def block_products(rows: Rows, M: Array, N: Array) -> Array:
     """Compute ``M_k' N_k`` of every block; shape (blocks, p, q)."""
-    return np.stack([M[a:b].T @ N[a:b] for a, b in itertools.pairwise(rows.edges)])
+    found = np.empty((rows.edges.size - 1, M.shape[1], N.shape[1]))
+    for out, (a, b) in zip(found, itertools.pairwise(rows.edges), strict=True):
+        np.matmul(M[a:b].T, N[a:b], out=out)
+    return found
 
 
 def normal_equations(rows: Rows, M: Array, E: Array) -> NormalEquations:

@@ -93,6 +93,11 @@ class FitStep:
             A, b = A + pull.A, b + pull.b
         self._A, self._b, self._prior = A, b, prior
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all energies of the columns are finite numbers."""
+        return bool(np.isfinite(np.diag(self._A)).all())
+
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Compute the bounded step; `damping` is a share of the energy of each column."""
         return bounded_step(self._A, self._b, lower, upper, prior=self._prior, damping=damping)
@@ -108,7 +113,8 @@ def _products(columns: Array, moving: Array, e: Array) -> tuple[Array, Array]:
     def of(part: slice) -> tuple[Array, Array]:
         # one pass over the many columns saves time
         own = np.concatenate([moving[part].T, e[None, part]]).T
-        return columns[part].T @ own, own.T @ own
+        with np.errstate(over='ignore', invalid='ignore'):
+            return columns[part].T @ own, own.T @ own
 
     # two threads, as the command line and the nodes keep BLAS to one thread
     half = e.size // 2

@@ -74,6 +74,8 @@ class Fitted:
         Sum of squares of each block, held out in spread sets and in whole kinds of motion.
     pull : Pull or None
         Normal equations of the information besides the rows, for the free columns.
+    reach : float
+        Forecast of the mean square of the rows that more steps would reach; 0 if unknown.
     """
 
     state: State
@@ -86,6 +88,7 @@ class Fitted:
     errors: Array
     transfer: Array
     pull: Pull | None = None
+    reach: float = 0.0
 
     @property
     def J(self) -> Array:
@@ -129,8 +132,8 @@ class Fitted:
 def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[State, BaseColumns]:
     """Refit H within a law while effects stay; return the state and its columns."""
     rows, m = simulator.rows, law.size
-    columns, added = simulator.base_columns(law), simulator.added_columns(state)
-    base = BaseColumns.of(rows, np.concatenate([columns, added.T]).T)
+    added = simulator.added_columns(state)
+    base = BaseColumns.of(rows, simulator.base_columns(law, added.T).T)
     effects = simulator.run(state) - added @ state.only_adds - simulator.bare(state)
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
@@ -155,17 +158,6 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
     return BaseColumns.of(rows, columns.T)
 
 
-def _require_finite(state: State, e: Array, moving: Array) -> None:
-    """Raise ModelError if an effect runs away, so that no number is left to fit."""
-    if not state.effects:
-        return
-    with np.errstate(over='ignore', invalid='ignore'):
-        squares = np.append(np.einsum('ij,ij->j', moving, moving), e @ e)
-    if not np.isfinite(squares).all():
-        names = ', '.join(added.name for added in state.effects)
-        raise ModelError(f'the model with {names} runs away on these data')
-
-
 def fit_jointly(
     simulator: Simulator,
     state: State,
@@ -188,82 +180,134 @@ def fit_jointly(
     for a state and its number of free numbers.  Singular equations raise IdentificationError, and
     an effect that cannot run on these data raises ModelError.
     """
-    rows = simulator.rows
-    # a fixed H, or an H that is drawn to the given one, leaves changes of its gain to the effects
-    free_h = state.law is not None and pull_at is None
-    parameters = free_parameters(state, len(rows.names), rows.longest if free_h else None)
-    p = base.columns.shape[1] + len(parameters)
-    damping, last, poor, old = DAMPING, 0.0, 0, base
-    e = rows.x - simulator.remember(state)
-    moving = _derivatives(simulator, state, parameters, tick)
-    given = pull_at and pull_at(state, p)
-    for done in range(iterations):
-        _require_finite(state, e, moving)
-        prior = _prior(rows, e, p, state, parameters)
-        pull = _with_known(state, parameters, prior, given)
-        before = _loss(e, pull)
-        least = max(TOLERANCE * before, enough * e.size)
-        lower, upper = _room(state, parameters, p)
-        step = FitStep(base, moving, e, prior, pull)
-        aside = moving[:, [_only_adds(state, number) for number in parameters]]
-        better, scale = None, Scale(rows, base, state.coefficients, e, aside)
-        for failed in range(ATTEMPTS):
-            tick()
-            delta = step.solve(lower, upper, damping)
-            promised = step.gain(delta)
-            if promised < least:
-                break
-            factor = scale.of(moving @ delta[p - len(parameters) :])
-            try:
-                trial = _moved(state, parameters, delta, lower, factor)
-                left = rows.x - simulator.remember(trial)
-            except ModelError:
-                damping *= WORSE ** (failed + 1)
-                continue
-            new = pull_at and pull_at(trial, p)
-            after = _loss(left, _with_known(trial, parameters, prior, new))
-            if np.isfinite(after) and after < before:
-                better = trial
-                break
-            damping *= WORSE ** (failed + 1)
-        if better is None:
+    fit = _Fit(simulator, state, base, tick, pull_at)
+    last, reach = 0.0, 0.0
+    for more in reversed(range(iterations)):
+        before = fit.loss
+        least = max(TOLERANCE * before, enough * fit.e.size)
+        promised = fit.step(least)
+        if not promised:
             break
-        gain, more = before - after, iterations - 1 - done
-        damping = max(damping * next_damping(gain / promised), LEAST_DAMPING)
-        state, e, given = better, left, new
-        poor = poor + 1 if gain < KEPT[0] * promised else 0
-        may_renew = more > 1 and base is old and state.law is not None
-        is_slow = poor > 0 and may_renew
-        if poor >= POOR and may_renew:
+        after = fit.loss
+        gain = before - after
+        fit.poor = fit.poor + 1 if gain < KEPT[0] * promised else 0
+        may_renew = more > 1 and fit.base is base and fit.state.law is not None
+        is_slow = fit.poor > 0 and may_renew
+        if fit.poor >= POOR and may_renew:
             # the effects now change H in another way than its columns assume
-            base = base_at(simulator, state)
-        moving = _derivatives(simulator, state, parameters, tick)
+            fit.base = base_at(simulator, fit.state)
+        fit.linearise()
         # a first step, or steps with old columns, say little about later steps
-        hopeless = done > 0 and not is_slow and after - _to_come(gain, last, more) > goal * e.size
+        is_known = last > 0.0 and not is_slow
+        hopeless = is_known and after - _to_come(gain, last, more) > goal * fit.e.size
+        is_steady = is_known and fit.poor == 0
+        reach = (after - _to_come(gain, last, ITERATIONS)) / fit.e.size if is_steady else 0.0
         if hopeless or gain < least:
             break
         last = gain
-    lower, upper = _room(state, parameters, p)
-    alive = np.concatenate([np.diag(base.total), np.sum(moving**2, axis=0)]) > 0.0
-    free = (lower < -1e-12) & (upper > 1e-12) & alive
-    prior = _prior(rows, e, p, state, parameters)
-    pull = _with_known(state, parameters, prior, given)
-    E = e[:, None]
-    known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
-    equations = with_columns(rows, known, base.columns, moving, E).only(free)
-    own, firm = pull and pull.only(free), _firm(rows, state, prior, moving)
-    return Fitted(
-        state=state,
-        base=base,
-        e=e,
-        moving=moving,
-        free=free,
-        parameters=parameters,
-        prior=prior,
-        errors=held_out_errors(equations, rows.fold, prior[free], own)[:, 0],
-        transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
-        pull=own,
-    )
+    return fit.result(reach)
+
+
+class _Fit:
+    """
+    A fit under way: its state with residual, derivatives and damping.
+
+    `loss` is the sum of squares, with that of the pull.  `poor` counts consecutive steps that
+    gained too little of what they promised.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        state: State,
+        base: BaseColumns,
+        tick: Callable[[], None],
+        pull_at: Callable[[State, int], Pull] | None,
+    ) -> None:
+        rows = simulator.rows
+        # a fixed H, or an H that is drawn to the given one, leaves changes of its gain to the
+        # effects
+        free_h = state.law is not None and pull_at is None
+        self._parameters = free_parameters(
+            state, len(rows.names), rows.longest if free_h else None
+        )
+        self._simulator, self._tick, self._pull_at = simulator, tick, pull_at
+        self._p = base.columns.shape[1] + len(self._parameters)
+        self._damping = DAMPING
+        self.state, self.base, self.poor = state, base, 0
+        self.e = rows.x - simulator.remember(state)
+        self._given = pull_at and pull_at(state, self._p)
+        self.linearise()
+
+    def linearise(self) -> None:
+        """Compute the derivatives in the present state."""
+        state, parameters = self.state, self._parameters
+        self._moving = _derivatives(self._simulator, state, parameters, self._tick)
+        self._prior = _prior(self._simulator.rows, self.e, self._p, state, parameters)
+        self._pull = _with_known(state, parameters, self._prior, self._given)
+        self.loss = _loss(self.e, self._pull)
+
+    def step(self, least: float) -> float:
+        """
+        Take one step that lowers the loss; return the gain that it promised.
+
+        The result is 0 if a step promises less than `least`, or if no step lowers the loss.
+        """
+        rows, parameters = self._simulator.rows, self._parameters
+        equations = FitStep(self.base, self._moving, self.e, self._prior, self._pull)
+        if self.state.effects and not (np.isfinite(self.loss) and equations.is_finite):
+            names = ', '.join(added.name for added in self.state.effects)
+            raise ModelError(f'the model with {names} runs away on these data')
+        lower, upper = _room(self.state, parameters, self._p)
+        aside = self._moving[:, [_only_adds(self.state, number) for number in parameters]]
+        scale = Scale(rows, self.base, self.state.coefficients, self.e, aside)
+        for failed in range(ATTEMPTS):
+            self._tick()
+            delta = equations.solve(lower, upper, self._damping)
+            promised = equations.gain(delta)
+            if promised < least:
+                break
+            factor = scale.of(self._moving @ delta[self._p - len(parameters) :])
+            try:
+                trial = _moved(self.state, parameters, delta, lower, factor)
+                left = rows.x - self._simulator.remember(trial)
+            except ModelError:
+                self._damping *= WORSE ** (failed + 1)
+                continue
+            new = self._pull_at and self._pull_at(trial, self._p)
+            gain = self.loss - _loss(left, _with_known(trial, parameters, self._prior, new))
+            if gain > 0.0:
+                self._damping = max(self._damping * next_damping(gain / promised), LEAST_DAMPING)
+                self.state, self.e, self._given = trial, left, new
+                self.loss -= gain
+                return promised
+            self._damping *= WORSE ** (failed + 1)
+        return 0.0
+
+    def result(self, reach: float) -> Fitted:
+        """Compute the errors of held-out blocks; `reach` is that of `Fitted`."""
+        rows, base, moving = self._simulator.rows, self.base, self._moving
+        lower, upper = _room(self.state, self._parameters, self._p)
+        E = self.e[:, None]
+        known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
+        equations = with_columns(rows, known, base.columns, moving, E)
+        is_seen = np.diag(equations.A.sum(axis=0)) > 0.0
+        free = (lower < -1e-12) & (upper > 1e-12) & is_seen
+        equations, own = equations.only(free), self._pull and self._pull.only(free)
+        firm = _firm(rows, self.state, self._prior, moving)
+        return Fitted(
+            state=self.state,
+            base=base,
+            e=self.e,
+            moving=moving,
+            free=free,
+            parameters=self._parameters,
+            prior=self._prior,
+            errors=held_out_errors(equations, rows.fold, self._prior[free], own)[:, 0],
+            transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
+            pull=own,
+            reach=reach,
+        )
 
 
 def _to_come(gain: float, last: float, more: int) -> float:

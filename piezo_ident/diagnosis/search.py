@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+import functools
 from functools import partial
 from threading import Event
 
@@ -209,6 +210,7 @@ def _contenders(
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
     at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
+    is_visible = functools.cache(lambda fitted: shows(simulator, fitted, noise))
 
     def alive() -> None:
         tick(at)
@@ -244,18 +246,18 @@ def _contenders(
         goal = FORM_RATIO * contenders[0].mean_square + done if is_shown else worth
         try:
             fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
-            is_shown, other = shows(simulator, fitted, noise), beside_wide[contender.name]
+            is_shown, other = is_visible(fitted), beside_wide[contender.name]
             if other is not contender and not (is_shown and fitted.mean_square < done):
                 # a few iterations cannot rank the two bases
                 near = AHEAD * fitted.mean_square
                 goal = min(goal, near) if is_shown else goal
                 other = _to_the_end(simulator, other, noise, goal, alive)
                 ahead = near < other.mean_square
-                if shows(simulator, other, noise) and not (ahead and is_shown):
+                if not (ahead and is_shown) and is_visible(other):
                     contenders[i], is_shown = other, True
         except (IdentificationError, ModelError) as error:
             warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
-    contenders = [c for c in contenders if shows(simulator, c, noise)]
+    contenders = list(filter(is_visible, contenders))
     contenders.sort(key=lambda c: c.mean_square)
     return contenders, warnings
 
@@ -322,7 +324,14 @@ def _begun(
 def _to_the_end(
     simulator: Simulator, fitted: Fitted, noise: float, goal: float, tick: Callable[[], None]
 ) -> Fitted:
-    """Repeat a fit with fresh columns of H until the gain is too small to matter."""
+    """
+    Repeat a fit with fresh columns of H until the gain is too small to matter.
+
+    A fit stays as it is if the next linear step and the forecast of further steps both leave more
+    than the mean square `goal`.
+    """
+    if min(fitted.reach, fitted.mean_square) > goal:
+        return fitted
     enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square

@@ -10,7 +10,7 @@ effects.  The signals before the changed link are kept from the run before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 import functools
@@ -111,9 +111,9 @@ class Simulator:
         lags = [filter_arx(G.a, G.b, delay.apply(r.u)) / G.gain - r.u for r in self.rows.runs]
         return self.rows.percent(float(np.mean(self.rows.of(lags) ** 2))) >= SMALLEST_EFFECT
 
-    def base_columns(self, law: HysteresisLaw) -> Array:
+    def base_columns(self, law: HysteresisLaw, more: Array) -> Array:
         """
-        Filter the columns of a law through G, as rows; shape (size, n).
+        Filter the columns of a law through G, and append the rows `more`; shape (size + k, n).
 
         Effects are left out of these columns.  Effects change the columns by a few percent, and
         this only alters the path to the optimum.
@@ -125,15 +125,18 @@ class Simulator:
             self._of_law = None
             self._of_law = key, self._of_columns(wide.size, partial(self._behind_G, wide))
         whole = self._of_law[1]
-        return whole if law.name == wide.name else whole[law.within(wide)]
+        places = slice(None) if law.name == wide.name else law.within(wide)
+        found = np.empty((law.size + more.shape[0], self.rows.n))
+        found[: law.size], found[law.size :] = whole[places], more
+        return found
 
-    def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Array:
-        """Compute the rows of some columns of a law in a run."""
+    def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Iterator[Array]:
+        """Yield the rows of some columns of a law in a run."""
         links = (DynamicsOperator(self.model.dynamics), DelayOperator(self.model.delay))
         source = self._sources[i]
         behind = Behind(links, (float(source.x[0]),), (source,), self.rows.m)
         raw = law.columns(source.x, self.rows.memories[i](law.thresholds), places)
-        return np.stack([behind.rows(x, float(x[0])) for x in raw])
+        return (behind.rows(x, float(x[0])) for x in raw)
 
     def columns(self, state: State, law: HysteresisLaw, step: float, more: Array) -> Array:
         """
@@ -144,7 +147,7 @@ class Simulator:
         """
         chains = self._known(state).chains
 
-        def of_run(i: int, places: range) -> Array:
+        def of_run(i: int, places: range) -> Iterator[Array]:
             # each call builds its own links, as another thread may run the same chain
             chain = self._chain(state, i)
             chain.blocks = chains[i].blocks
@@ -162,7 +165,7 @@ class Simulator:
                 )
                 cores = (self._chain(s, i).operators[core] for s in moved)
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
-            return np.stack([behind.rows(x, float(x[0])) / step for x in changes])
+            return (behind.rows(x, float(x[0])) / step for x in changes)
 
         return self._of_columns(law.size, of_run, more)
 
@@ -317,10 +320,10 @@ class Simulator:
 
     def _behind_core(
         self, slopes: Sequence[Mapping[str, Array]], names: Sequence[str], i: int, places: range
-    ) -> Array:
+    ) -> list[Array]:
         kept, own = self._known(), [slopes[i][names[k]] for k in places]
         chain = self._chain(kept.state, i)
-        return np.stack(chain.behind_core(own, kept.chains[i].blocks, self.rows.m))
+        return chain.behind_core(own, kept.chains[i].blocks, self.rows.m)
 
     def _filtered(self, effect: type[Effect] | None, sections: Array, i: int) -> Array:
         chain = self._known().chains[i]
@@ -331,7 +334,10 @@ class Simulator:
         return list(self._pool.map(function, range(len(self._sources))))
 
     def _of_columns(
-        self, size: int, function: Callable[[int, range], Array], more: Array | None = None
+        self,
+        size: int,
+        function: Callable[[int, range], Iterable[Array]],
+        more: Array | None = None,
     ) -> Array:
         """Collect columns from a function of a run and of places, and append more columns."""
         keep = self.rows.keep
@@ -348,9 +354,9 @@ class Simulator:
             i, places = task
             if not places:
                 return
-            columns = function(i, places)
-            own = columns if keep[i].all() else columns[:, keep[i]]
-            whole[places, ends[i] : ends[i + 1]] = own
+            is_whole = bool(keep[i].all())
+            for place, column in zip(places, function(i, places), strict=True):
+                whole[place, ends[i] : ends[i + 1]] = column if is_whole else column[keep[i]]
 
         for _ in self._pool.map(fill, tasks):
             pass
