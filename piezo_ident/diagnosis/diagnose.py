@@ -23,9 +23,7 @@ from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis.candidates import CandidateSearch
 from piezo_ident.diagnosis.decision import decide
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
-from piezo_ident.diagnosis.found_effects import found_effects
 from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
-from piezo_ident.diagnosis.known_error import missed_now
 from piezo_ident.diagnosis.messages import (
     left_over,
     part_judged,
@@ -33,7 +31,7 @@ from piezo_ident.diagnosis.messages import (
     sentence,
     warnings_of,
 )
-from piezo_ident.diagnosis.refined_model import refine, Refined
+from piezo_ident.diagnosis.refined_model import found_effects, refine, Refined
 from piezo_ident.diagnosis.refits import law_of, refits, walk, with_numerator
 from piezo_ident.diagnosis.results import (
     Diagnosis,
@@ -48,6 +46,7 @@ from piezo_ident.diagnosis.verdict import (
     errors_of_laws,
     errors_of_sets,
     judge,
+    missed_now,
     smallest_detectable,
     untestable_of,
 )

@@ -18,15 +18,19 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
-from piezo_ident.diagnosis.cross_validation import (
+from piezo_ident.diagnosis.equations import (
     held_out_errors,
     normal_equations,
     with_columns,
 )
-from piezo_ident.diagnosis.joint_fit import base_at, cost_of_decays, fit_jointly, Fitted
-from piezo_ident.diagnosis.polishing import with_fresh_columns
+from piezo_ident.diagnosis.joint_fit import (
+    base_at,
+    fit_jointly,
+    Fitted,
+    with_fresh_columns,
+)
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import CREEP, State
+from piezo_ident.diagnosis.state import cost_of_decays, CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
 
 #: share of the rms error of held-out blocks that may remain with earlier creep

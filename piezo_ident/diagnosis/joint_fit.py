@@ -11,25 +11,42 @@ candidate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.cross_validation import (
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
+from piezo_ident.diagnosis.equations import (
+    BaseColumns,
+    FitStep,
     held_out_errors,
     held_out_residual,
+    KEPT,
+    next_damping,
     NormalEquations,
     Pull,
     right_sides,
+    Scale,
     with_columns,
+    WORSE,
 )
-from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, KEPT, next_damping, Scale, WORSE
-from piezo_ident.diagnosis.parameters import free_parameters, FreeParameter
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.state import (
+    cost_of_decays,
+    firm,
+    free_parameters,
+    FreeParameter,
+    moved,
+    only_adds,
+    places_of_decays,
+    prior_of,
+    room_of,
+    State,
+    with_known,
+)
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
@@ -40,14 +57,6 @@ DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 POOR = 2
 #: lowest ratio of a gain to the gain before, as assumed for the forecast of future gains
 LEAST_RATIO = 0.5
-#: share of the energy of a parameter's column that other kinds of excitation must hold to
-#: determine the parameter
-FIRM = 0.01
-#: expected size of a weight of H, and of its other coefficients, normalised: the prior that keeps
-#: collinear plays small
-WEIGHT_SPREAD, WIDE_SPREAD = 0.1, 1.0
-#: creep of size d from before a record costs a fit as much as an rms error of this times d
-EARLIER_COST = 0.003
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
 
@@ -124,7 +133,7 @@ class Fitted:
         The residual is normalised.  Blocks with the same number in `sets` are held out together;
         the default are sets spread over all data.
         """
-        prior = self.prior if sets is None else _firm(rows, self.state, self.prior, self.moving)
+        prior = self.prior if sets is None else firm(rows, self.state, self.prior, self.moving)
         sets = rows.fold if sets is None else sets
         return held_out_residual(rows, self.J, self.e, prior[self.free], sets, self.pull)
 
@@ -138,7 +147,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
     lower, upper = np.full(base.columns.shape[1], -np.inf), np.full(base.columns.shape[1], np.inf)
     lower[:m] = law.lower
     prior = np.zeros(base.columns.shape[1])
-    prior[_places_of_decays(state)] = cost_of_decays(rows)
+    prior[places_of_decays(state)] = cost_of_decays(rows)
     step = FitStep(base, np.empty((rows.n, 0)), rows.x - effects, prior)
     theta = step.solve(lower, upper)
     return state.with_only_added(theta[m:]).with_coefficients(law, theta[:m]), base
@@ -243,8 +252,8 @@ class _Fit:
         """Compute the derivatives in the present state."""
         state, parameters = self.state, self._parameters
         self._moving = _derivatives(self._simulator, state, parameters, self._tick)
-        self._prior = _prior(self._simulator.rows, self.e, self._p, state, parameters)
-        self._pull = _with_known(state, parameters, self._prior, self._given)
+        self._prior = prior_of(self._simulator.rows, self.e, self._p, state, parameters)
+        self._pull = with_known(state, parameters, self._prior, self._given)
         self.loss = _loss(self.e, self._pull)
 
     def step(self, least: float) -> float:
@@ -258,8 +267,8 @@ class _Fit:
         if self.state.effects and not (np.isfinite(self.loss) and equations.is_finite):
             names = ', '.join(added.name for added in self.state.effects)
             raise ModelError(f'the model with {names} runs away on these data')
-        lower, upper = _room(self.state, parameters, self._p)
-        aside = self._moving[:, [_only_adds(self.state, number) for number in parameters]]
+        lower, upper = room_of(self.state, parameters, self._p)
+        aside = self._moving[:, [only_adds(self.state, number) for number in parameters]]
         scale = Scale(rows, self.base, self.state.coefficients, self.e, aside)
         for failed in range(ATTEMPTS):
             self._tick()
@@ -269,13 +278,13 @@ class _Fit:
                 break
             factor = scale.of(self._moving @ delta[self._p - len(parameters) :])
             try:
-                trial = _moved(self.state, parameters, delta, lower, factor)
+                trial = moved(self.state, parameters, delta, lower, factor)
                 left = rows.x - self._simulator.remember(trial)
             except ModelError:
                 self._damping *= WORSE ** (failed + 1)
                 continue
             new = self._pull_at and self._pull_at(trial, self._p)
-            gain = self.loss - _loss(left, _with_known(trial, parameters, self._prior, new))
+            gain = self.loss - _loss(left, with_known(trial, parameters, self._prior, new))
             if gain > 0.0:
                 self._damping = max(self._damping * next_damping(gain / promised), LEAST_DAMPING)
                 self.state, self.e, self._given = trial, left, new
@@ -287,14 +296,14 @@ class _Fit:
     def result(self, reach: float) -> Fitted:
         """Compute the errors of held-out blocks; `reach` is that of `Fitted`."""
         rows, base, moving = self._simulator.rows, self.base, self._moving
-        lower, upper = _room(self.state, self._parameters, self._p)
+        lower, upper = room_of(self.state, self._parameters, self._p)
         E = self.e[:, None]
         known = NormalEquations(base.products, *right_sides(rows, base.columns, E))
         equations = with_columns(rows, known, base.columns, moving, E)
         is_seen = np.diag(equations.A.sum(axis=0)) > 0.0
         free = (lower < -1e-12) & (upper > 1e-12) & is_seen
         equations, own = equations.only(free), self._pull and self._pull.only(free)
-        firm = _firm(rows, self.state, self._prior, moving)
+        strong = firm(rows, self.state, self._prior, moving)
         return Fitted(
             state=self.state,
             base=base,
@@ -304,7 +313,7 @@ class _Fit:
             parameters=self._parameters,
             prior=self._prior,
             errors=held_out_errors(equations, rows.fold, self._prior[free], own)[:, 0],
-            transfer=held_out_errors(equations, rows.group, firm[free], own)[:, 0],
+            transfer=held_out_errors(equations, rows.group, strong[free], own)[:, 0],
             pull=own,
             reach=reach,
         )
@@ -321,61 +330,6 @@ def _to_come(gain: float, last: float, more: int) -> float:
 
 def _loss(e: Array, pull: Pull | None) -> float:
     return float(e @ e) + (0.0 if pull is None else pull.s)
-
-
-def _firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
-    """
-    Strengthen the prior for parameters that only a left-out kind of excitation determines.
-
-    Example: only a multisine reaches a limit of the slew rate, so other motion leaves the limit
-    open.  Creep from earlier motion is determined by the motion at the start of a record alone.
-    """
-    firm = prior.copy()
-    firm[_places_of_decays(state)] += rows.n / FIRM
-    firm[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
-    return firm
-
-
-def _prior(
-    rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
-) -> Array:
-    # neighbouring residuals are similar: a block counts as a few observations, not as thousands
-    count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
-    # curves and lags are nearly collinear: only large steps of them have an effect
-    plays = 0 if state.law is None else state.law.thresholds.size
-    spread, size = np.full(p, np.inf), state.coefficients.size
-    spread[:size] = np.where(np.arange(size) < plays, WEIGHT_SPREAD, WIDE_SPREAD)
-    spread[p - len(parameters) :] = [number.spread for number in parameters]
-    prior: Array = float(e @ e) / count / spread**2
-    prior[_places_of_decays(state)] = cost_of_decays(rows)
-    return prior
-
-
-def _places_of_decays(state: State) -> slice:
-    """Return the places of creep from earlier motion, behind H and the offsets."""
-    first = state.coefficients.size + state.offsets.size
-    return slice(first, first + state.earlier.size)
-
-
-def cost_of_decays(rows: Rows) -> float:
-    """Return the weight of the pull of creep from earlier motion towards zero."""
-    return rows.n * EARLIER_COST**2
-
-
-def _with_known(
-    state: State, parameters: Sequence[FreeParameter], prior: Array, pull: Pull | None
-) -> Pull | None:
-    """Add to a pull the pull of numbers known to be small towards zero, weighted by `prior`."""
-    p = prior.size
-    size = np.zeros(p)
-    size[_places_of_decays(state)] = state.earlier.ravel()
-    for j, number in enumerate(parameters, start=p - len(parameters)):
-        if np.isfinite(number.spread):
-            size[j] = number.get(state)
-    b, s = -prior * size, float(prior @ size**2)
-    if pull is None:
-        return Pull(np.zeros((p, p)), b, s) if size.any() else None
-    return Pull(pull.A, pull.b + b, pull.s + s)
 
 
 def _derivatives(
@@ -409,30 +363,34 @@ def _derivatives(
     return columns.T
 
 
-def _room(state: State, parameters: tuple[FreeParameter, ...], p: int) -> tuple[Array, Array]:
-    lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
-    if state.law is not None:
-        lower[: state.coefficients.size] = np.minimum(state.law.lower - state.coefficients, 0.0)
-    for j, parameter in enumerate(parameters, start=p - len(parameters)):
-        lower[j], upper[j] = parameter.room(state)
-    return lower, upper
+#: a fit ends after a step that gains less than this share of the mean square of the noise, or of
+#: the smallest effect if that is smaller
+OF_LEAST = 0.01
+#: size of a meaningless difference, rms in % of stroke: weights of H never describe a stage more
+#: exactly
+INDISTINCT = 0.01
+#: most repetitions with fresh columns, and the smallest gain that justifies another one
+POLISHING, POLISH = 6, 0.02
 
 
-def _only_adds(state: State, parameter: FreeParameter) -> bool:
-    """Return whether a parameter belongs to an effect that only adds to the signal."""
-    i = parameter.effect
-    return i is not None and state.effects[i].effect.change == 'passed'
+def least_gain(rows: Rows, noise: float) -> float:
+    """Return the smallest useful gain of a step for a given noise; both are mean squares."""
+    return OF_LEAST * min(noise, rows.square(SMALLEST_EFFECT))
 
 
-def _moved(
-    state: State, parameters: tuple[FreeParameter, ...], step: Array, lower: Array, factor: float
-) -> State:
-    """Return the state after a step; `factor` divides steps of H that reach no bound."""
-    m, k = state.coefficients.size, state.only_adds.size
-    new = state.with_only_added(state.only_adds + step[m : m + k])
-    if state.law is not None:
-        of_H = np.where(step[:m] > lower[:m], step[:m] / factor, step[:m])
-        new = new.with_coefficients(state.law, state.coefficients + of_H)
-    for parameter, delta in zip(parameters, step[m + k :], strict=True):
-        new = parameter.moved(new, float(delta))
-    return new
+def good_enough(rows: Rows, noise: float) -> float:
+    """Return the mean square below which a residual cannot be separated from the noise."""
+    return noise + rows.square(INDISTINCT)
+
+
+def with_fresh_columns(
+    simulator: Simulator, fitted: Fitted, tick: Callable[[], None], *, enough: float = 0.0
+) -> Fitted:
+    """Repeat a fit with columns of H in the state reached, as long as the error falls."""
+    for _ in range(POLISHING):
+        state = fitted.state
+        fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=enough, tick=tick)
+        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted

@@ -14,21 +14,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import IdentificationError
+from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
-from piezo_ident.diagnosis.cross_validation import held_out_errors, normal_equations
 from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
-from piezo_ident.diagnosis.fit_steps import BaseColumns
-from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
-from piezo_ident.diagnosis.polishing import POLISH, POLISHING
+from piezo_ident.diagnosis.equations import BaseColumns, held_out_errors, normal_equations, Pull
+from piezo_ident.diagnosis.joint_fit import (
+    base_at,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    POLISH,
+    POLISHING,
+)
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import means
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
-from piezo_ident.diagnosis.toward_given import toward_given
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 
@@ -182,22 +187,25 @@ def _steps(
 
 def with_numerator(simulator: Simulator, step: Step) -> Step:
     """
-    Fit the numerator of G again, in turn with all else, beside an effect in the loop of G.
+    Fit the numerator of G again, in turn with all else, beside an effect that moves a mode of G.
 
     An identification without the effect has distorted G.  The effect itself moves its mode, so
     this pole stays.  Other poles may have imitated the effect, so G is tried without them, too.
-    The result is the given step if its error falls by less than a `POLISH`.
+    The result is the given step if its error falls by less than a `POLISH`, or if the fit fails.
     """
     model, best = simulator.model, step
     for added in step.fitted.state.effects:
-        if not added.effect.contains:
+        mode = added.effect.mode(added.values[0])
+        if mode is None:
             continue
-        frequency, damping = (float(added.values[0][k]) for k in ('frequency', 'damping'))
-        for a in (model.dynamics.a, _poles_of(frequency, damping, model.sample_rate)):
+        for a in (model.dynamics.a, _poles_of(*mode, model.sample_rate)):
             last = step
             for _ in range(POLISHING):
-                state = _with_other_numerator(simulator, last.fitted.state, a)
-                fitted = fit_jointly(simulator, state, base_at(simulator, state))
+                try:
+                    state = _with_other_numerator(simulator, last.fitted.state, a)
+                    fitted = fit_jointly(simulator, state, base_at(simulator, state))
+                except (IdentificationError, ModelError):
+                    break
                 if not fitted.mean_square <= (1.0 - POLISH) * last.fitted.mean_square:
                     break
                 last = replace(last, fitted=fitted)
@@ -264,3 +272,71 @@ def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
         transfer=transfer,
     )
     return Step('gain', step, gain)
+
+
+#: number of samples of a sweep over the range
+SWEEP = 60
+
+
+def loops(low: float, high: float) -> Array:
+    """Return a motion from `low` through loops that hang from both ends, and some between."""
+    turns = [0.0]
+    for level in np.arange(1, 7) / 6:
+        turns += [level, 0.0]
+    turns.append(1.0)
+    for level in np.arange(1, 6) / 6:
+        turns += [level, 1.0]
+    turns.append(0.0)
+    for level in (0.3, 0.6, 0.9):
+        turns += [level, level - 0.15, level, level - 0.15]
+    turns.append(0.0)
+    sweeps = [
+        np.linspace(a, b, max(2, round(SWEEP * abs(b - a))), endpoint=False)
+        for a, b in itertools.pairwise(turns)
+    ]
+    return low + (high - low) * np.concatenate(sweeps)
+
+
+def toward_given(
+    simulator: Simulator,
+    given: State,
+    fitted: Fitted,
+    tick: Callable[[], None] = lambda: None,
+) -> Fitted:
+    """
+    Repeat a fit of rows without labelled kinds of motion, drawn to the given H.
+
+    Such rows do not test a refitted H under other motion.  The given H was identified on other
+    motion, so it counts as data, too:
+
+        min  |e|^2 + n mean((h - h_0 - c)^2)
+
+    Here h and h_0 are the new and the given H under loops over the range of the model.  n is the
+    number of rows.  c is the mean difference, which offsets compensate.  The given H keeps terms
+    small that these rows hardly determine.  Such terms compensate for one another on these rows,
+    but not elsewhere.  The given H does not count if the data cover only a part of the range: the
+    refined model then holds in this part only.
+    """
+    law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
+    if law is None or rows.kinds or not rows.covers(scaling.range):
+        return fitted
+    u = loops(*map(float, scaling.u(scaling.range)))
+    P = np.stack(list(law.columns(u)), axis=1)
+    P -= P.mean(axis=0)
+    h = given.hysteresis(u)
+    h = h - h.mean()
+    P, h = (x / np.sqrt(u.size) for x in (P, h))
+    # equal weight of rows and given H: a smaller weight fitted these rows better and other motion
+    # worse
+    weight = float(rows.n)
+    A = weight * (P.T @ P)
+
+    def pull_at(state: State, size: int) -> Pull:
+        k = law.size
+        whole, right = np.zeros((size, size)), np.zeros(size)
+        left = h - P @ state.coefficients
+        whole[:k, :k], right[:k] = A, weight * (P.T @ left)
+        return Pull(whole, right, weight * float(left @ left))
+
+    state = fitted.state
+    return fit_jointly(simulator, state, base_at(simulator, state), tick=tick, pull_at=pull_at)

@@ -22,18 +22,25 @@ from threading import Event
 
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
-from piezo_ident.diagnosis.fit_steps import BaseColumns
-from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Fitted
+from piezo_ident.diagnosis.equations import BaseColumns
+from piezo_ident.diagnosis.joint_fit import (
+    base_at,
+    fit_base,
+    fit_jointly,
+    Fitted,
+    good_enough,
+    least_gain,
+    POLISHING,
+)
 from piezo_ident.diagnosis.next_experiment import look_alikes
-from piezo_ident.diagnosis.polishing import good_enough, least_gain, POLISHING
 from piezo_ident.diagnosis.rows import Rows
-from piezo_ident.diagnosis.signature import shows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import (
     best_trials,
     score_trials,
     Scored,
+    shows,
     started,
     Tick,
     TrialColumns,

@@ -167,7 +167,9 @@ class Simulator:
                 changes = (op.process(before).x - chain.blocks[core + 1].x for op in cores)
             return (behind.rows(x, float(x[0])) / step for x in changes)
 
-        return self._of_columns(law.size, of_run, more)
+        found = self._of_columns(law.size, of_run, len(more))
+        found[law.size :] = more
+        return found
 
     def added_columns(self, state: State) -> Array:
         """Return a column for each number of `State.only_adds`; shape (n, records (1 + times))."""
@@ -334,28 +336,21 @@ class Simulator:
         return list(self._pool.map(function, range(len(self._sources))))
 
     def _of_columns(
-        self,
-        size: int,
-        function: Callable[[int, range], Iterable[Array]],
-        more: Array | None = None,
+        self, size: int, function: Callable[[int, range], Iterable[Array]], more: int = 0
     ) -> Array:
-        """Collect columns from a function of a run and of places, and append more columns."""
+        """Collect columns from a function of a run and of places, and leave room for more."""
         keep = self.rows.keep
         ends = np.cumsum([0, *(int(k.sum()) for k in keep)])
         # a single run is shared by all processors; contiguous columns may run side by side
         share = -(-self._threads // len(keep))
         cuts = [size * k // share for k in range(share + 1)]
         tasks = [(i, range(*cut)) for i in range(len(keep)) for cut in itertools.pairwise(cuts)]
-        extra = np.empty((0, self.rows.n)) if more is None else more
-        whole = np.empty((size + extra.shape[0], self.rows.n))
-        whole[size:] = extra
+        whole = np.empty((size + more, self.rows.n))
 
         def fill(task: tuple[int, range]) -> None:
             i, places = task
-            if not places:
-                return
             is_whole = bool(keep[i].all())
-            for place, column in zip(places, function(i, places), strict=True):
+            for place, column in zip(places, function(i, places) if places else (), strict=True):
                 whole[place, ends[i] : ends[i + 1]] = column if is_whole else column[keep[i]]
 
         for _ in self._pool.map(fill, tasks):

@@ -272,6 +272,11 @@ class Effect:
         return True
 
     @classmethod
+    def mode(cls, values: Mapping[str, Any]) -> tuple[float, float] | None:
+        """Give frequency [Hz] and damping ratio of the mode of G that the effect moves, if any."""
+        return None
+
+    @classmethod
     def added_delay(cls, values: Mapping[str, Any]) -> float:
         """Give the delay [samples] that an effect `in_delay_line` adds."""
         return 0.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import product
 import math
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -209,6 +210,11 @@ class LoopHysteresis(Effect):
                 f'effect {cls.name}: elastic and stiffness add up to {left - 1.0:g}, which leaves '
                 'the mode no stiffness; their sum must stay above -1'
             )
+
+    @classmethod
+    def mode(cls, values: Mapping[str, Any]) -> tuple[float, float]:
+        """Give frequency [Hz] and damping ratio of the mode with this spring."""
+        return float(values['frequency']), float(values['damping'])
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

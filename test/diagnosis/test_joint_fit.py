@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
-from piezo_ident.diagnosis.fit_steps import BaseColumns, FitStep, next_damping, Scale
+from piezo_ident.diagnosis.equations import BaseColumns, FitStep, next_damping, Scale
 from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly
 from piezo_ident.diagnosis.refits import base_thresholds
 from piezo_ident.diagnosis.rows import make_rows

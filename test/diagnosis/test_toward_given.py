@@ -8,15 +8,14 @@ from dataclasses import replace
 from diagnosis_examples import measured, played, refined_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled
-from piezo_ident.diagnosis.cross_validation import held_out_residual, solve
 from piezo_ident.diagnosis.diagnose import diagnose
+from piezo_ident.diagnosis.equations import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
-from piezo_ident.diagnosis.refits import refits
+from piezo_ident.diagnosis.refits import loops, refits, toward_given
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import centred, make_rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
-from piezo_ident.diagnosis.toward_given import loops, toward_given
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.record.record import Record
 from programs import SLOW, slow_model
