@@ -14,7 +14,7 @@ therefore tried beside the H as given, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import ALIKE, LITTLE, RIVALS, SMALLEST_EFFECT, TAKES
@@ -38,29 +38,41 @@ IN_ALL_WAYS = 3
 Tick = Callable[[float], None]
 
 
-class CandidateSearch:
+@dataclass(frozen=True, eq=False)
+class Known:
     """
-    Search that fits the candidates of some data.
+    What is known before the search.
 
-    `lines` are the frequencies of lines in the residual [Hz].  `noise` is the mean square of the
-    noise of a row.  `missed` is the possible error of G (`Candidates.missed`).  `effects` names
-    the effects that may be added.
+    Attributes
+    ----------
+    given : State
+        State of the model as given.
+    lines : tuple of float
+        Frequencies of lines in the residual [Hz].
+    noise : float
+        Mean square of the noise of a row.
+    missed : float
+        Possible error of G, see `Candidates.missed`.
     """
+
+    given: State
+    lines: tuple[float, ...]
+    noise: float
+    missed: float
+
+
+class CandidateSearch:
+    """Search that fits the candidates of some data; `effects` names those that may be added."""
 
     def __init__(
         self,
         simulator: Simulator,
-        given: State,
-        lines: Sequence[float],
-        noise: float,
-        missed: float,
+        known: Known,
         effects: Sequence[str],
         rng: np.random.Generator,
         tick: Tick,
     ) -> None:
-        self._simulator, self._given, self._rng, self._tick = simulator, given, rng, tick
-        self._noise, self._missed = noise, missed
-        self._lines = lines
+        self._simulator, self._known, self._rng, self._tick = simulator, known, rng, tick
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
         # a change of a known effect of the path would look like another such effect
@@ -127,7 +139,7 @@ class CandidateSearch:
             have = {c.way for c in candidates.of(effects)}
             state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
             # a treatment with a larger error than the best treatment does not count
-            goal = np.inf if effects == sets[0] else self._noise + candidates.left(best)
+            goal = np.inf if effects == sets[0] else self._known.noise + candidates.left(best)
             more = []
             if 'given' not in have:
                 # beside the given H, an effect of the path is compared with a refit, too
@@ -151,7 +163,7 @@ class CandidateSearch:
     def _ways(self, plays: Fitted, wide: Fitted) -> Candidates:
         """Fit the candidates without an effect, except for the effects of the refits."""
         simulator = self._simulator
-        state = replace(self._given, effects=wide.state.effects)
+        state = replace(self._known.given, effects=wide.state.effects)
         given = fit_jointly(simulator, state, base_at(simulator, state))
         if plays.state.effects != wide.state.effects:
             plays = refit_of(simulator, state, 'plays')
@@ -159,7 +171,7 @@ class CandidateSearch:
         found = [Candidate((), way, fitted) for way, fitted in named.items()]
         if simulator.is_fast:
             found += [replace(found[i], fitted=with_g(simulator, found[i].fitted)) for i in (0, 2)]
-        return Candidates(simulator.rows, self._noise, self._missed, tuple(found))
+        return Candidates(simulator.rows, self._known.noise, self._known.missed, tuple(found))
 
     def _with_each(
         self, base: Candidate, some: Sequence[type[Effect]], goal: float
@@ -205,14 +217,13 @@ class CandidateSearch:
             self._tick(1.0 - 0.6 ** (done + share))
 
         return search_round(
-            self._simulator,
+            TrialColumns(self._simulator, fitted.state, self._known.lines),
             fitted,
             effects,
-            TrialColumns(self._simulator, fitted.state, self._lines),
-            self._noise,
+            self._known.noise,
             self._rng,
             tick,
-            goal=self._noise + goal,
+            goal=self._known.noise + goal,
         )
 
 

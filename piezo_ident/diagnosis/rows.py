@@ -279,25 +279,12 @@ def make_rows(
             f'{FEWEST * m} are needed; give a longer record that begins at rest at the lowest '
             'voltage, or drives the stage over its whole range'
         )
-    longest = max(1, kept // BLOCKS)
-    blocks, labels = list[Integers](), list[str]()
-    first = 0
-    for run, good in zip(runs, keep, strict=True):
-        number = np.full(good.size, -1)
-        for label, start, stop in stretches(run.record, run.piece, m):
-            count = max(1, round((stop - start) / longest))
-            for part in np.array_split(np.arange(start, stop), count):
-                if good[part].any():
-                    number[part] = first
-                    labels.append(label)
-                    first += 1
-        blocks.append(number[good])
+    block, labels = _in_blocks(runs, keep, m)
     x = [block_means(run.x, m)[good] for run, good in zip(runs, keep, strict=True)]
     record = np.array([names.index(run.record) for run in runs])
     of_record = np.concatenate(
         [np.full(int(good.sum()), k) for good, k in zip(keep, record, strict=True)]
     )
-    block = np.unique(np.concatenate(blocks), return_inverse=True)[1]
     group, group_labels = held_out_kinds(labels, _blocks_of(runs, keep, m, block))
     first_of = {run.record: run.piece.start_time for run in reversed(runs)}
     begin = np.array([0.0 if _has_clock(model) else first_of[run.record] for run in runs])
@@ -334,6 +321,22 @@ def _whole_rows(known: Mask, m: int) -> Mask:
     both = (x[: x.size // m * m].reshape(-1, m) for x in (known, closed(known, FEW)))
     counts, whole = (x.sum(axis=1) for x in both)
     return np.asarray((whole == m) & (2 * counts >= m))
+
+
+def _in_blocks(runs: Sequence[Run], keep: Sequence[Mask], m: int) -> tuple[Integers, list[str]]:
+    """Cut rows into blocks; return the block of each row, and the label of each block."""
+    longest = max(1, sum(int(k.sum()) for k in keep) // BLOCKS)
+    blocks, labels = list[Integers](), list[str]()
+    for run, good in zip(runs, keep, strict=True):
+        number = np.full(good.size, -1)
+        for label, start, stop in stretches(run.record, run.piece, m):
+            count = max(1, round((stop - start) / longest))
+            for part in np.array_split(np.arange(start, stop), count):
+                if good[part].any():
+                    number[part] = len(labels)
+                    labels.append(label)
+        blocks.append(number[good])
+    return np.unique(np.concatenate(blocks), return_inverse=True)[1], labels
 
 
 def _blocks_of(runs: Sequence[Run], keep: Sequence[Mask], m: int, block: Integers) -> list[Array]:

@@ -21,6 +21,7 @@ from functools import partial
 from threading import Event
 
 import numpy as np
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
 from piezo_ident.diagnosis.equations import BaseColumns
 from piezo_ident.diagnosis.joint_fit import (
@@ -107,10 +108,9 @@ class Round:
 
 
 def search_round(
-    simulator: Simulator,
+    columns: TrialColumns,
     before: Fitted,
     effects: Sequence[type[Effect]],
-    columns: TrialColumns,
     noise: float,
     rng: np.random.Generator,
     tick: Tick,
@@ -123,12 +123,7 @@ def search_round(
     `noise` is the mean square of the noise of a row, and `rng` draws the shifts of the surrogates.
     A fit ends early if it cannot reach the mean square `goal`.
     """
-    n = simulator.rows.n
-    shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
-    shifted = [np.roll(before.e, int(k)) for k in shifts]
-    # a residual may be periodic: a shift by one period is then no surrogate
-    shifted.sort(key=lambda e: abs(float(e @ before.e)))
-    surrogates = np.stack(shifted[:SURROGATES], axis=1)
+    surrogates, n = _surrogates(before.e, rng), columns.rows.n
     trials: dict[str, list[Scored]] = {}
     chance: dict[str, float] = {}
     visible: dict[str, float] = {}
@@ -142,30 +137,20 @@ def search_round(
             trials.setdefault(name, []).append(scored)
     for scores in trials.values():
         scores.sort(key=lambda s: s.error)
-    best = {name: scores[0] for name, scores in trials.items()}
-    total = float(before.errors.sum())
-    least = WORTH_FIT * max(total - noise * n, 1e-300)
-    promising = [scores for scores in trials.values() if total - scores[0].error > least]
-    promising.sort(key=lambda scores: scores[0].error)
-    chosen = promising[:JOINT_FITS]
-    # a small step does not separate an effect from its look-alikes, so these are fitted, too
-    first = chosen[0][0].effect if chosen else None
-    alike = (*look_alikes(first.name), *first.contains) if first else ()
-    chosen += [scores for scores in promising[JOINT_FITS:] if scores[0].effect.name in alike]
     starts = [
         (
             scores[0].effect,
             # the law with the best small step may not be the law with the best fit
-            [before.state.with_effect(started(simulator.rows, s)) for s in scores[:STARTS]],
+            [before.state.with_effect(started(columns.rows, s)) for s in scores[:STARTS]],
         )
-        for scores in chosen
+        for scores in _promising(list(trials.values()), before, noise)
     ]
-    _add_plain_starts(simulator, before, starts, columns)
-    contenders, warnings = _contenders(simulator, before, starts, noise, goal, tick)
+    _add_plain_starts(columns, before, starts)
+    contenders, warnings = _contenders(columns.simulator, before, starts, noise, goal, tick)
     tick(1.0)
     return Round(
         before=before,
-        best=best,
+        best={name: scores[0] for name, scores in trials.items()},
         contenders=tuple(contenders),
         chance=chance,
         visible=visible,
@@ -173,11 +158,35 @@ def search_round(
     )
 
 
+def _surrogates(e: Array, rng: np.random.Generator) -> Array:
+    """Shift a residual in time so that nothing of it is left in place; shape (n, surrogates)."""
+    n = e.size
+    shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
+    shifted = [np.roll(e, int(k)) for k in shifts]
+    # a residual may be periodic: a shift by one period is then no surrogate
+    shifted.sort(key=lambda one: abs(float(one @ e)))
+    return np.stack(shifted[:SURROGATES], axis=1)
+
+
+def _promising(trials: Sequence[list[Scored]], before: Fitted, noise: float) -> list[list[Scored]]:
+    """Select the effects that are fitted, from the scores of each effect, the best first."""
+    total = float(before.errors.sum())
+    least = WORTH_FIT * max(total - noise * before.e.size, 1e-300)
+    promising = [scores for scores in trials if total - scores[0].error > least]
+    promising.sort(key=lambda scores: scores[0].error)
+    chosen = promising[:JOINT_FITS]
+    if not chosen:
+        return []
+    # a small step does not separate an effect from its look-alikes, so these are fitted, too
+    first = chosen[0][0].effect
+    alike = (*look_alikes(first.name), *first.contains)
+    return chosen + [x for x in promising[JOINT_FITS:] if x[0].effect.name in alike]
+
+
 def _add_plain_starts(
-    simulator: Simulator,
+    columns: TrialColumns,
     before: Fitted,
     starts: Sequence[tuple[type[Effect], list[State]]],
-    columns: TrialColumns,
 ) -> None:
     """
     Add to each effect a start beside a sum of plays, converted to the wide law of H.
@@ -185,7 +194,7 @@ def _add_plain_starts(
     A wide H that has absorbed an effect rarely releases it.  A start with a far larger error than
     before is left out.  An effect that is either on or off keeps its start in any case.
     """
-    law = before.state.law
+    simulator, law = columns.simulator, before.state.law
     if not starts or law is None or law.name == 'plays':
         return
     plays = HysteresisLaw('plays', law.thresholds, law.span)

@@ -96,8 +96,8 @@ class TrialColumns:
     """
 
     def __init__(self, simulator: Simulator, state: State, lines: Sequence[float]) -> None:
-        self.rows = simulator.rows
-        self._simulator, self._state = simulator, state
+        self.simulator, self.rows = simulator, simulator.rows
+        self._state = state
         self._view = _view_of(simulator, lines)
         #: for each effect: its trials that can run, with the places of their settings, and the
         #: change of the rows for each setting, in single precision to save memory
@@ -131,12 +131,12 @@ class TrialColumns:
         found, trials = list[Array](), list[tuple[Trial, list[int]]]()
         for trial in effect.trials(self._view):
             tick()
-            self._simulator.remember(self._state)
+            self.simulator.remember(self._state)
             settings = trial.settings()
             keys = [tuple(np.asarray(x).tobytes() for x in one.values()) for one in settings]
             new = {k: one for k, one in zip(keys, settings, strict=True) if k not in known}
             added = [Added(effect.name, (one,) * len(rows.names)) for one in new.values()]
-            for key, column in zip(new, self._simulator.added(added), strict=True):
+            for key, column in zip(new, self.simulator.added(added), strict=True):
                 known[key] = None
                 if column is not None and np.all(np.isfinite(column)):
                     known[key] = len(found)

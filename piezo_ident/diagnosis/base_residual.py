@@ -1,0 +1,167 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Refit H, and find what the residual shows before effects are searched: faults, lines and noise.
+
+H is refitted by the free-run error, so that an error of H is not mistaken for an effect.  The
+remaining residual gives lines and the noise floor, and thereby the error to explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from piezo_ident.common.errors import IdentificationError
+from piezo_ident.diagnosis.candidates import Known
+from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
+from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.refits import refits
+from piezo_ident.diagnosis.rows import centred, make_rows, means
+from piezo_ident.diagnosis.simulator import Simulator
+from piezo_ident.diagnosis.state import CREEP, State
+from piezo_ident.diagnosis.verdict import missed_now
+from piezo_ident.identification.prepare import filled_in
+from piezo_ident.model.metrics import REVERSED, runs_against
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.record.record import Record
+from piezo_ident.residual import (
+    all_stretches,
+    channel_tests,
+    ChannelTest,
+    find_faults,
+    find_lines,
+    LineSearch,
+    NoiseFloor,
+    residual_noise_floor,
+    ResidualPart,
+    without_channels,
+    without_lines,
+)
+from piezo_ident.residual.faults import FaultSearch
+
+#: effect with a test of its own, by its lines
+HUM = 'periodic_disturbance'
+#: share of the voltage range within which the command counts as resting with noise
+TREMBLES = 0.01
+#: the displacement does not follow the voltage if a larger share of its variance stays unexplained
+UNRELATED = 0.99
+#: the displacement runs against the model if their correlation is lower; no change of a stage
+#: causes this
+AGAINST = -0.9
+
+
+def prepared(model: StageModel, records: Sequence[Record]) -> tuple[Simulator, FaultSearch]:
+    """Cut records to rows without the faults that the residual shows; fill the gaps."""
+    rows = make_rows(model, records)
+    given = State(model.hysteresis, np.zeros(len(rows.names)))
+    faults = find_faults(_parts(Simulator(model, rows), given))
+    if any(bad.any() for bad in faults.bad):
+        rows = make_rows(model, records, faults.bad)
+    if not all(run.use.all() for run in rows.runs):
+        pairs = zip(rows.runs, Simulator(model, rows).full(given), strict=True)
+        runs = tuple(filled_in(run, model.scaling.y(x), model.scaling) for run, x in pairs)
+        rows = replace(rows, runs=runs, x=rows.of([run.x for run in runs]))
+    return Simulator(model, rows), faults
+
+
+@dataclass(frozen=True, eq=False)
+class BaseResidual:
+    """
+    The model with another H, and what its residual shows.
+
+    `plays` and `wide` are H refitted as plays and as the better of the wide laws.  `single` is the
+    mean square of the noise of single samples, or None.
+    """
+
+    known: Known
+    plays: Fitted
+    wide: Fitted
+    channels: tuple[ChannelTest, ...]
+    lines: LineSearch
+    floor: NoiseFloor
+    single: float | None
+
+    @property
+    def significant(self) -> list[str]:
+        """Effects that tests of their own have shown."""
+        # motion of another axis makes lines, too: the lines left beside its model are hum
+        is_coupled = any(test.significant for test in self.channels)
+        tests = {'cross_coupling': is_coupled, HUM: bool(self.lines.lines)}
+        return [name for name, is_seen in tests.items() if is_seen]
+
+    @property
+    def tested(self) -> set[str]:
+        """Effects whose own tests had something to search; nothing of them is left to fit."""
+        found = {HUM} if self.lines.searched else set()
+        return found | ({'cross_coupling'} if any(test.tells for test in self.channels) else set())
+
+
+def base_residual(simulator: Simulator, quantum: float) -> BaseResidual:
+    """Refit H, and find lines and noise of the residual."""
+    model, rows = simulator.model, simulator.rows
+    given = State(model.hysteresis, np.zeros(len(rows.names)))
+    # each record has its own offset, as the sensor may have been zeroed again
+    given = replace(given, offsets=means(rows.x - simulator.run(given), rows.of_record))
+    if any(setting.name == CREEP for setting in model.effects):
+        as_given = fit_jointly(simulator, given, base_at(simulator, given))
+        given = with_earlier_motion(simulator, as_given).state
+    plays, wide = refits(simulator, given)
+    _check_related(simulator, given, plays)
+    channels, lines, floor = _beside_the_drive(simulator, wide.state)
+    noise, single = floor.squares(quantum, rows.m, abs(model.scaling.Y))
+    left = float(np.mean((rows.x - simulator.run(given)) ** 2))
+    # while a memory settles, periods differ by more than the noise, and the estimated noise is too
+    # large; no model errs by less than the noise, so the smallest error bounds it
+    excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
+    single = None if single is None else single - excess
+    frequencies = tuple(line.frequency for line in lines.lines)
+    known = Known(given, frequencies, noise - excess, missed_now(simulator))
+    return BaseResidual(known, plays, wide, channels, lines, floor, single)
+
+
+def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
+    """Compute the residual of each run [m]; `whole` includes samples after an unknown start."""
+    Y = simulator.model.scaling.Y
+    return [
+        ResidualPart(run.record, run.piece, (run.x - x) * Y, run.use if whole else run.known)
+        for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
+    ]
+
+
+def _beside_the_drive(
+    simulator: Simulator, state: State
+) -> tuple[tuple[ChannelTest, ...], LineSearch, NoiseFloor]:
+    """Test a state's residual for further channels and lines, and estimate the remaining noise."""
+    parts = _parts(simulator, state)
+    channels = channel_tests(parts)
+    # another axis that moves in sines causes lines, too
+    parts = without_channels(parts, channels)
+    found = find_lines(parts, all_stretches(parts))
+    # hum and another axis are no noise, as an effect can explain them
+    resting = _parts(simulator, state, whole=True)
+    quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
+    return channels, found, residual_noise_floor(quiet, all_stretches(resting))
+
+
+def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
+    """Raise IdentificationError if the displacement does not follow the voltage."""
+    rows = simulator.rows
+    swing = max(float(np.ptp(run.u)) for run in rows.runs)
+    # other disturbances may be larger if the voltage only trembles
+    if swing <= TREMBLES:
+        return
+    names = ', '.join(rows.names)
+    moved = float(np.mean(centred(rows.x, rows.of_record) ** 2))
+    if base.mean_square > UNRELATED * moved:
+        raise IdentificationError(
+            f'{names}: the displacement does not follow the voltage: a hysteresis accounts for '
+            f'only {max(0.0, 100.0 * (1.0 - base.mean_square / moved)):.1g} % of blocks that it '
+            'was not fitted to; is the sensor connected, and do both columns come from one stage?'
+        )
+    known, of_each = simulator.run(given), (rows.of_record == k for k in np.unique(rows.of_record))
+    # the voltage moves, as checked above, so small motion counts here, too
+    if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, AGAINST):
+        raise IdentificationError(f'{names}: {REVERSED}')
