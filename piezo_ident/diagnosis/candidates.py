@@ -142,10 +142,7 @@ class CandidateSearch:
             goal = np.inf if effects == sets[0] else self._known.noise + candidates.left(best)
             more = []
             if 'given' not in have:
-                # beside the given H, an effect of the path is compared with a refit, too
-                of_path = len(effects) == 1 and find_effect(effects[0]).rate_independent
-                base, most = base_at(self._simulator, state), np.inf if of_path else goal
-                fitted = fit_jointly(self._simulator, state, base, goal=most)
+                fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
                 fitted = with_earlier_motion(self._simulator, fitted)
                 state = fitted.state
                 more.append(replace(best, way='given', fitted=fitted))

@@ -55,6 +55,8 @@ DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 #: consecutive steps that gain too little of their predicted gain, after which the columns of H are
 #: computed again
 POOR = 2
+#: largest ratio of the gains of steps to the gain that the first of them promised
+BEYOND_PROMISE = 2.0
 #: lowest ratio of a gain to the gain before, as assumed for the forecast of future gains
 LEAST_RATIO = 0.5
 #: finite difference of a weight of H, normalised
@@ -194,13 +196,15 @@ def fit_jointly(
     for more in reversed(range(iterations)):
         before = fit.loss
         least = max(TOLERANCE * before, enough * fit.e.size)
-        promised = fit.step(least)
+        may_renew = more > 1 and fit.base is base and fit.state.law is not None
+        # what each step to come must gain to reach the goal; old columns say little about that
+        worth = (before - goal * fit.e.size) / (1 + more) if last > 0.0 and not may_renew else 0.0
+        promised = fit.step(max(least, worth / BEYOND_PROMISE))
         if not promised:
             break
         after = fit.loss
         gain = before - after
         fit.poor = fit.poor + 1 if gain < KEPT[0] * promised else 0
-        may_renew = more > 1 and fit.base is base and fit.state.law is not None
         is_slow = fit.poor > 0 and may_renew
         if fit.poor >= POOR and may_renew:
             # the effects now change H in another way than its columns assume
