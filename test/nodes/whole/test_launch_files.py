@@ -230,16 +230,6 @@ def test_two_axes_reach_every_node():
     assert track['feedforward']['axes'] == track['excitation']['axes'] == ['b', 'c']
 
 
-def test_what_is_not_given_stays_as_the_files_have_it(tmp_path):
-    for name in NODES:
-        text = (ROOT / f'config/{name}.yaml').read_text(encoding='utf-8')
-        text = text.replace('program: identification', 'program: holds')
-        (tmp_path / f'{name}.yaml').write_text(text.replace('stage: paper', 'stage: effects'))
-    started = carry_out(file_of('demo'), {'config': str(tmp_path)}, {})
-    assert started['', 'excitation']['program'] == started['', 'identifier']['program'] == 'holds'
-    assert started['', 'stage']['stage'] == 'effects'
-
-
 def test_a_value_that_is_no_choice_is_refused():
     with pytest.raises(RuntimeError, match='use_simulated_stage: no'):
         carry_out(file_of('demo'), {'use_simulated_stage': 'no'}, {})
@@ -248,12 +238,15 @@ def test_a_value_that_is_no_choice_is_refused():
 def test_a_stage_in_a_namespace_with_a_driver_and_a_configuration_of_its_own(tmp_path):
     for name in NODES:
         text = (ROOT / f'config/{name}.yaml').read_text(encoding='utf-8')
+        text = text.replace('program: identification', 'program: holds')
         (tmp_path / f'{name}.yaml').write_text(text.replace('max_order: 15', 'max_order: 7'))
     context = {'namespace': 'left', 'config': str(tmp_path), 'use_simulated_stage': 'false'}
     started = carry_out(file_of('stage'), context, {})
     assert set(started) == {('left', n) for n in ('excitation', 'identifier', 'model')}
     assert started['left', 'identifier']['max_order'] == 7
+    # what is not given stays as the files have it
     assert started['left', 'identifier']['output'] == 'identified'
+    assert {started['left', n]['program'] for n in ('excitation', 'identifier')} == {'holds'}
 
 
 def test_nothing_else_is_imported():
