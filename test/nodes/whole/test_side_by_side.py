@@ -27,7 +27,7 @@ WHERE = ('a/', '')
 
 
 def test_two_graphs_side_by_side(tmp_path):
-    excitation = {'subscribers': 4, 'block_size': 500}
+    excitation = {'subscribers': 4, 'block_size': 500, 'rate_factor': 2.0}
     identifier = {**QUICK, 'program': PROGRAM}
     with Graph() as g:
         applied = {

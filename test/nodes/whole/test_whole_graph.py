@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
         g.lines()
         models, reports = g.texts('model'), g.texts('report')
         g.start_all(
-            ('excitation', {'subscribers': 3, 'block_size': 500}),
+            ('excitation', {'subscribers': 3, 'block_size': 500, 'rate_factor': 2.0}),
             ('stage', {'seed': 3}),
             ('identifier', {**QUICK, 'program': PROGRAM}),
             ('model', {'window': 0.5, 'observe_gain': True, 'adapt': 'hysteresis'}),
@@ -142,10 +142,9 @@ def test_live_replayed_and_offline_models_are_equal(whole):
     models = [whole.texts('model')[-1]]
     bag = whole.output / 'bag'
     replayed = whole.texts('replay/model')
-    players = [
-        whole.start('player', {'bag': str(bag), 'rate': 4.0}, 'replay', wait=False),
-        whole.start('identifier', QUICK, 'replay', wait=False),
-    ]
+    players = whole.start_all(
+        ('player', {'bag': str(bag), 'rate': 4.0}, 'replay'), ('identifier', QUICK, 'replay')
+    )
     try:
         end = whole.finish('replay/player/start')
         assert end['state'] == 'done', end
