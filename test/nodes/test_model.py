@@ -116,17 +116,6 @@ def test_without_a_model_it_waits_and_says_so(lab):
     assert node.stop() == 0 and 'Traceback' not in node.log
 
 
-def test_prediction_is_the_model_bit_for_bit_and_carries_t_and_segment(fast):
-    since = reset(fast)
-    send(fast, blocks(6000))
-    t, y = heard(fast, 'prediction', since['prediction'], 60)
-    expected_t, v = sine(6000)
-    np.testing.assert_array_equal(t, expected_t)
-    np.testing.assert_array_equal(y, model_of(paper()).stream().process(v, t))
-    last = fast.collect('prediction')[-1]
-    assert (last.segment, last.quantity) == ('sine:5Hz', 'displacement')
-
-
 def test_a_model_with_a_band_publishes_its_half_width_beside_the_prediction(fast):
     band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
     text = paper(identification={KEY: band.to_dict()})
@@ -141,10 +130,15 @@ def test_a_model_with_a_band_publishes_its_half_width_beside_the_prediction(fast
     np.testing.assert_array_equal(half, BandStream(model_of(text), 0.9).follow(v, y))
 
 
-def test_a_new_model_takes_over_without_a_glitch(fast):
+def test_prediction_is_the_model_bit_for_bit_and_a_new_one_takes_over_without_a_glitch(fast):
     since = reset(fast)
     send(fast, blocks(6000))
-    heard(fast, 'prediction', since['prediction'], 60)
+    t, y = heard(fast, 'prediction', since['prediction'], 60)
+    expected_t, v = sine(6000)
+    np.testing.assert_array_equal(t, expected_t)
+    np.testing.assert_array_equal(y, model_of(paper()).stream().process(v, t))
+    last = fast.collect('prediction')[-1]
+    assert (last.segment, last.quantity) == ('sine:5Hz', 'displacement')
     taken = int(fast.status('model')['models'])
     fast.publish_text('model', OTHER)
     new, (_, v) = model_of(OTHER), sine(12_000)
