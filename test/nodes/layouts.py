@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 import json
 from pathlib import Path
 import re
@@ -17,10 +17,18 @@ from piezo_ident.record.bags.read import opened_bag, typestore
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 
 
-def _messages(bag: Path) -> Iterator[tuple[str, Any]]:
+#: topic and message
+Message = tuple[str, Any]
+
+
+def messages_of(bag: Path) -> list[Message]:
+    """Return all messages of a bag."""
+    store = typestore()
     with opened_bag(bag) as opened:
-        for connection, _, raw in opened.messages(opened.connections):
-            yield connection.topic, typestore().deserialize_cdr(raw, connection.msgtype)
+        return [
+            (connection.topic, store.deserialize_cdr(raw, connection.msgtype))
+            for connection, _, raw in opened.messages(opened.connections)
+        ]
 
 
 def shown_by_plotjuggler() -> Iterator[str]:
@@ -33,9 +41,9 @@ def shown_by_plotjuggler() -> Iterator[str]:
         )
 
 
-def series_of_plotjuggler(bag: Path) -> Iterator[str]:
+def series_of_plotjuggler(messages: Iterable[Message]) -> Iterator[str]:
     """Return the names that PlotJuggler 3 gives to joint states and diagnostics."""
-    for topic, message in _messages(bag):
+    for topic, message in messages:
         kind = type(message).__name__.rpartition('__')[2]
         if kind == 'JointState':
             yield from (f'{topic}/{name}/position' for name in message.name)
@@ -57,10 +65,10 @@ def shown_by_foxglove() -> Iterator[str]:
             yield panel['xAxisPath']['value']
 
 
-def found_by_foxglove(bag: Path, path: str) -> bool:
+def found_by_foxglove(messages: Iterable[Message], path: str) -> bool:
     """Return whether a message path of the kinds above leads to a value."""
     topic, _, rest = path.partition('.')
-    for name, message in _messages(bag):
+    for name, message in messages:
         if name != topic:
             continue
         if index := re.fullmatch(r'position\[(\d+)\]', rest):

@@ -12,6 +12,7 @@ from graph import Graph
 from graph_page import DIAGNOSTICS, OPERATOR, rights, ROOT, SERVICES, STATES, TOPICS
 from layouts import (
     found_by_foxglove,
+    messages_of,
     series_of_plotjuggler,
     shown_by_foxglove,
     shown_by_plotjuggler,
@@ -167,7 +168,7 @@ def test_live_replayed_and_offline_models_are_equal(whole):
 
 
 def test_layouts_show_what_was_recorded(whole):
-    recorded = whole.output / 'bag'
+    recorded = messages_of(whole.output / 'bag')
     missing = set(shown_by_plotjuggler()) - set(series_of_plotjuggler(recorded))
     assert not missing
     for path in shown_by_foxglove():
