@@ -11,6 +11,7 @@ The signal handlers of rclpy shut the context down before a node can ramp its dr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import gc
 import logging
 import os
 from pathlib import Path
@@ -243,6 +244,8 @@ def run(make: Callable[[], LabNode]) -> int:
     node, code = None, 0
     try:
         node = make()
+        # a full collection of all that the imports made would stop the node for tens of blocks
+        gc.freeze()
         node.introduce()
         ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience
         executor.add_node(node)

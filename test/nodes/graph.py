@@ -24,6 +24,7 @@ or wait with `matched`: both see to it that the nodes know of all readers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import gc
 import os
 from pathlib import Path
 import shutil
@@ -94,6 +95,8 @@ class Graph(Observer):
         self.node.create_subscription(
             DiagnosticArray, '/diagnostics', self._keep_diagnostics, QoSProfile(depth=1000)
         )
+        # a full collection stops this process for 0.2 s, and so the streams that tests send
+        gc.freeze()
         self._thread = threading.Thread(target=self._spin, name='observer', daemon=True)
         self._thread.start()
         return self
