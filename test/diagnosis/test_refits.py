@@ -1,17 +1,19 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A refit that knows one kind of motion alone, and the H that it was given."""
+"""Refits of H drawn to the given H, and of G beside an effect that moves its mode."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 from diagnosis_examples import measured, played, refined_model
 import numpy as np
-from piezo_ident.common.errors import Cancelled
+from piezo_ident.common.errors import Cancelled, ModelError
+from piezo_ident.diagnosis import refits as refits_module
 from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.equations import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
-from piezo_ident.diagnosis.refits import loops, refits, toward_given
+from piezo_ident.diagnosis.refits import loops, refits, Step, toward_given, with_numerator
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import centred, make_rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -137,3 +139,24 @@ def test_a_drift_that_is_left_out_leaves_the_zero_where_it_was(refit):
     v = without_labels().pieces[0].v
     means = [float(m.simulate(v).mean()) for m in (simulator.model, refined)]
     assert means[0] == pytest.approx(means[1], abs=1e-3 * abs(scaling.Y))
+
+
+def test_a_failed_fit_of_the_numerator_keeps_the_step(monkeypatch):
+    tried = []
+
+    def fails(simulator, state, a):
+        tried.append(np.array(a))
+        raise ModelError('no such filter')
+
+    monkeypatch.setattr(refits_module, '_with_other_numerator', fails)
+    spring = Added('loop_hysteresis', ({'frequency': 300.0, 'damping': 0.03},))
+    step = Step(
+        'plays', SimpleNamespace(state=SimpleNamespace(effects=(CREEP, spring)), mean_square=1.0)
+    )
+    model = slow_model()
+    assert with_numerator(SimpleNamespace(model=model), step) is step
+    # G as given, and the mode of the spring alone
+    assert np.array_equal(tried[0], model.dynamics.a)
+    pole = np.roots([1.0, *tried[1]])[0]
+    assert abs(np.log(pole)) * model.sample_rate == pytest.approx(2.0 * np.pi * 300.0)
+    assert len(tried) == 2
