@@ -80,7 +80,7 @@ def fit_free_run(
     if settings.solver == 'swarm':
         raise ConfigError(
             f'{runs[0].record}: the swarm fits H alone, so it needs segments labelled '
-            'noise and triangle; leave --solver swarm out, or label the segments'
+            'noise and triangle; take the solver least_squares, or label the segments'
         )
     chosen, parts = _fitted_parts(runs, settings)
     _refuse_rest(chosen, parts)
