@@ -59,22 +59,21 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path, len(order)))
 
 
-@pytest.fixture(scope='session')
-def idle_machine():
-    """Skip tests that judge seconds where other programs keep the processors busy."""
+@pytest.fixture(scope='session', autouse=True)
+def busy(request):
+    """Return the share of the processors that other programs keep busy, before any node starts."""
+    is_timed = any(item.get_closest_marker('timed') for item in request.session.items)
+    if not is_timed or not Path('/proc/stat').exists():
+        return 0.0
 
     def times():
         fields = [int(x) for x in Path('/proc/stat').read_text().split('\n', 1)[0].split()[1:8]]
         return sum(fields), fields[3] + fields[4]
 
-    if not Path('/proc/stat').exists():
-        return
     before = times()
     time.sleep(1.0)
     total, idle = (b - a for a, b in zip(before, times(), strict=True))
-    busy = 1.0 - idle / max(total, 1)
-    if busy > BUSY:
-        pytest.skip(f'other programs keep {100 * busy:.0f} % of the processors busy')
+    return 1.0 - idle / max(total, 1)
 
 
 @pytest.fixture
@@ -84,6 +83,6 @@ def blank_pictures(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def _timed_alone(request):
-    if request.node.get_closest_marker('timed'):
-        request.getfixturevalue('idle_machine')
+def _timed_alone(request, busy):
+    if busy > BUSY and request.node.get_closest_marker('timed'):
+        pytest.skip(f'other programs keep {100 * busy:.0f} % of the processors busy')
