@@ -14,9 +14,11 @@ therefore tried beside the H as given, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.criteria import ALIKE, LITTLE, RIVALS, SMALLEST_EFFECT, TAKES
 from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
@@ -141,18 +143,21 @@ class CandidateSearch:
             # a treatment with a larger error than the best treatment does not count
             goal = np.inf if effects == sets[0] else self._known.noise + candidates.left(best)
             more = []
-            if 'given' not in have:
-                fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
-                fitted = with_earlier_motion(self._simulator, fitted)
-                state = fitted.state
-                more.append(replace(best, way='given', fitted=fitted))
+            # an effect that runs away beside one H may hold beside another
+            with suppress(ModelError):
+                if 'given' not in have:
+                    fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
+                    fitted = with_earlier_motion(self._simulator, fitted)
+                    state = fitted.state
+                    more.append(replace(best, way='given', fitted=fitted))
             for way, law in laws.items():
-                if way not in have:
-                    fitted = refit_of(self._simulator, state, law, goal)
-                    more.append(replace(best, way=way, fitted=fitted))
-            if self._simulator.is_fast and not change_g(effects):
+                with suppress(ModelError):
+                    if way not in have:
+                        fitted = refit_of(self._simulator, state, law, goal)
+                        more.append(replace(best, way=way, fitted=fitted))
+            with suppress(ModelError):
                 last = min(more, key=candidates.left, default=best)
-                if not last.retunes:
+                if self._simulator.is_fast and not (change_g(effects) or last.retunes):
                     more.append(replace(last, fitted=with_g(self._simulator, last.fitted, goal)))
             candidates = candidates.and_these(more)
         return candidates

@@ -55,8 +55,6 @@ DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 #: consecutive steps that gain too little of their predicted gain, after which the columns of H are
 #: computed again
 POOR = 2
-#: largest ratio of the gains of steps to the gain that the first of them promised
-BEYOND_PROMISE = 2.0
 #: lowest ratio of a gain to the gain before, as assumed for the forecast of future gains
 LEAST_RATIO = 0.5
 #: finite difference of a weight of H, normalised
@@ -85,8 +83,6 @@ class Fitted:
         Sum of squares of each block, held out in spread sets and in whole kinds of motion.
     pull : Pull or None
         Normal equations of the information besides the rows, for the free columns.
-    reach : float
-        Forecast of the mean square of the rows that more steps would reach; 0 if unknown.
     """
 
     state: State
@@ -99,7 +95,6 @@ class Fitted:
     errors: Array
     transfer: Array
     pull: Pull | None = None
-    reach: float = 0.0
 
     @property
     def J(self) -> Array:
@@ -192,14 +187,12 @@ def fit_jointly(
     an effect that cannot run on these data raises ModelError.
     """
     fit = _Fit(simulator, state, base, tick, pull_at)
-    last, reach = 0.0, 0.0
+    last = 0.0
     for more in reversed(range(iterations)):
         before = fit.loss
         least = max(TOLERANCE * before, enough * fit.e.size)
         may_renew = more > 1 and fit.base is base and fit.state.law is not None
-        # what each step to come must gain to reach the goal; old columns say little about that
-        worth = (before - goal * fit.e.size) / (1 + more) if last > 0.0 and not may_renew else 0.0
-        promised = fit.step(max(least, worth / BEYOND_PROMISE))
+        promised = fit.step(least)
         if not promised:
             break
         after = fit.loss
@@ -213,12 +206,10 @@ def fit_jointly(
         # a first step, or steps with old columns, say little about later steps
         is_known = last > 0.0 and not is_slow
         hopeless = is_known and after - _to_come(gain, last, more) > goal * fit.e.size
-        is_steady = is_known and fit.poor == 0
-        reach = (after - _to_come(gain, last, ITERATIONS)) / fit.e.size if is_steady else 0.0
         if hopeless or gain < least:
             break
         last = gain
-    return fit.result(reach)
+    return fit.result()
 
 
 class _Fit:
@@ -297,8 +288,8 @@ class _Fit:
             self._damping *= WORSE ** (failed + 1)
         return 0.0
 
-    def result(self, reach: float) -> Fitted:
-        """Compute the errors of held-out blocks; `reach` is that of `Fitted`."""
+    def result(self) -> Fitted:
+        """Compute the errors of held-out blocks."""
         rows, base, moving = self._simulator.rows, self.base, self._moving
         lower, upper = room_of(self.state, self._parameters, self._p)
         E = self.e[:, None]
@@ -319,7 +310,6 @@ class _Fit:
             errors=held_out_errors(equations, rows.fold, self._prior[free], own)[:, 0],
             transfer=held_out_errors(equations, rows.group, strong[free], own)[:, 0],
             pull=own,
-            reach=reach,
         )
 
 

@@ -12,6 +12,7 @@ a step to a wider H only if the step removes most of the error on whole kinds of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
@@ -113,10 +114,12 @@ def walk(
     if candidates.rows.passes < PASSES:
         # a branch that was passed once cannot be held out
         return first
-    for step in steps:
-        tick()
-        if _left(candidates, step.fitted) <= TAKES * _left(candidates, last.fitted):
-            last = step
+    # an effect that runs away beside a further H ends the walk
+    with suppress(ModelError):
+        for step in steps:
+            tick()
+            if _left(candidates, step.fitted) <= TAKES * _left(candidates, last.fitted):
+                last = step
     if best is not None:
         return last
     # a gain is a single number, so it may replace a refit that is only slightly better
@@ -153,7 +156,14 @@ def _steps(
     state = candidates.as_given.fitted.state
     if best is not None:
         state = state.with_effects_of(best.fitted.state)
-    first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
+    try:
+        first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
+    except ModelError:
+        # beside the given H the effect runs away, so the H of the candidate stays
+        if best is None:
+            raise
+        yield Step(best.way, best.fitted)
+        return
     yield Step('given', first)
     plays = known.get('plays') or refit_of(simulator, first.state, 'plays', goal())
     yield Step('plays', plays)

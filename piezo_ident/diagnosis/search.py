@@ -340,14 +340,7 @@ def _begun(
 def _to_the_end(
     simulator: Simulator, fitted: Fitted, noise: float, goal: float, tick: Callable[[], None]
 ) -> Fitted:
-    """
-    Repeat a fit with fresh columns of H until the gain is too small to matter.
-
-    A fit stays as it is if the next linear step and the forecast of further steps both leave more
-    than the mean square `goal`.
-    """
-    if min(fitted.reach, fitted.mean_square) > goal:
-        return fitted
+    """Repeat a fit with fresh columns of H until the gain is too small to matter."""
     enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)
     for _ in range(POLISHING):
         state, before = fitted.state, fitted.mean_square

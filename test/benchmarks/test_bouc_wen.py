@@ -74,6 +74,16 @@ def test_a_hysteretic_spring_is_named_and_modelled(spring):
     assert after < 8e-6
 
 
+@pytest.mark.filterwarnings('ignore')
+def test_a_candidate_that_runs_away_does_not_end_the_diagnosis(spring):
+    u, y, linear, noise = spring
+    n = FITTED // 2
+    found = diagnosed(linear, u[:n], y[:n] + noise[:n])
+    # a step of this search leaves the range of numbers
+    before, after = (np.std((model.simulate(u) - y)[FITTED:]) for model in (linear, found.model))
+    assert after < 0.5 * before
+
+
 def test_nothing_is_named_for_the_linear_model_of_a_spring(spring):
     u, _, linear, noise = spring
     found = diagnosed(linear, u[:FITTED], linear.simulate(u[:FITTED]) + noise)
