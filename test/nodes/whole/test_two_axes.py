@@ -69,12 +69,12 @@ def identified(lab, tmp_path_factory):
     assert lab.set('excitation', 'in_turn', False)[0]
     lab.finish('recorder/stop')
     lab.wait(lambda: lab.texts('model'), 'the model')
+    (folder / 'model.yaml').write_text(lab.texts('model')[-1])
     return end, folder
 
 
 def test_a_run_identifies_both_axes(lab, identified):
     end, folder = identified
-    (folder / 'model.yaml').write_text(lab.texts('model')[-1])
     model = pi.load(folder / 'model.yaml')
     assert list(model.axes) == ['y', 'y_b'] and model.sample_rate == RATE
     report = json.loads(lab.texts('report')[-1])['axes']
@@ -94,7 +94,6 @@ def test_a_run_identifies_both_axes(lab, identified):
 
 
 def test_the_live_prediction_is_the_free_run(lab, identified):
-    (identified[1] / 'model.yaml').write_text(lab.texts('model')[-1])
     model = pi.load(identified[1] / 'model.yaml')
     lab.wait(lambda: lab.status('model')['state'] == 'predicting', 'a model')
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
