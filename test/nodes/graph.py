@@ -109,6 +109,8 @@ class Graph(Observer):
             self._end.set()
             # a node that is destroyed while the thread spins ends the process
             self._thread.join(60.0)
+            # what is frozen keeps entities of nodes that are destroyed
+            gc.unfreeze()
             self._executor.shutdown(timeout_sec=1.0)
             self.node.destroy_node()
             rclpy.shutdown(context=self.context)
