@@ -105,8 +105,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         raise ConfigError(f'{record.name}: has no displacement to compare with; leave out --plot')
     if unknown := [axis for axis in models_of(model) if axis not in known]:
         with naming(str(args.model)):
-            made = predict(model, record)
-            others = {axis: each_of(made)[axis] for axis in unknown}
+            made = each_of(predict(model, record))
+            others = {axis: made[axis] for axis in unknown}
             pieces |= others
             if args.interval:
                 halves |= bands(model, record, others, args.interval)

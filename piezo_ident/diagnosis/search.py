@@ -16,8 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-import functools
-from functools import partial
+from functools import cache, partial
 from threading import Event
 
 import numpy as np
@@ -226,7 +225,7 @@ def _contenders(
     contenders, warnings = list[Fitted](), list[str]()
     beside_wide: dict[str, Fitted] = {}
     at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
-    is_visible = functools.cache(lambda fitted: shows(simulator, fitted, noise))
+    is_visible = cache(lambda fitted: shows(simulator, fitted, noise))
 
     def alive() -> None:
         tick(at)

@@ -78,8 +78,8 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     """
     Choose the candidate with the lowest price; of alike prices, the fewest parameters.
 
-    The lower price decides between equal numbers of parameters.  The first candidate
-    wins if no error is resolved, because rounding decides which of the weights are zero.
+    The lower price decides between equal numbers of parameters.  The first candidate wins
+    if no error is resolved, because rounding decides which of the weights are zero.
     """
     least = min(c.price for c in candidates)
     alike = [c for c in candidates if c.price <= ALIKE * least]

@@ -74,8 +74,8 @@ class Promise:
 
     `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
     within the swings and speeds of these records.  `other` is None, which means not known, if each
-    segment of motion was in a fit.  Hum, drift and other
-    effects of time count in full: the other record has them, and the model does not.
+    segment of motion was in a fit.  Hum, drift and other effects of time count in full: the other
+    record has them, and the model does not.
     """
 
     same: float
