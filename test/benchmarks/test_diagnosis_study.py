@@ -366,5 +366,5 @@ def test_a_page_counts_the_lines_of_its_file(name):
     page = (ROOT / f'docs/{name}.md').read_text(encoding='utf-8')
     with (ROOT / f'docs/{name}.csv').open(encoding='utf-8', newline='') as file:
         lines = list(csv.DictReader(file))
-    assert f'{len(lines)} of {len(lines)} cases done' in page
+    assert f'{len(lines)} of {len(lines)} cases' in page
     assert f'({name}.csv), {len(lines)} lines' in page
