@@ -7,14 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.live.predictor import AxesRun
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 
 RATE = 1000.0
+AXES = ('y', 'y_b')
 #: what the first axis moves of the second, and the second of the first
 CROSS = 0.01, 0.02
+#: what a model knows of its error from its identification [% of stroke]
+ERRORS = {'errors': {'held_out': 0.02}}
 
 
 def chain(weights, pole, Y):
@@ -36,6 +40,36 @@ def scanner():
     return pi.MultiAxisModel(
         {'y': path(first, 'motion_b', CROSS[1]), 'y_b': path(second, 'motion', CROSS[0])}
     )
+
+
+def creeping():
+    """Return the scanner with a first axis that creeps."""
+    creep = EffectSetting('creep', {'gain': [0.02, 0.03], 'time_constant': [0.3, 20.0]})
+    axes = {a: replace(x, identification=ERRORS) for a, x in scanner().axes.items()}
+    first = axes['y']
+    return pi.MultiAxisModel({**axes, 'y': replace(first, effects=(creep, *first.effects))})
+
+
+def grown(model, axis, gain=1.03):
+    """Return a stage that moves more on one axis than its model."""
+    one = model.axes[axis]
+    more = replace(one, hysteresis=one.hysteresis.scaled(gain))
+    return pi.MultiAxisModel({**model.axes, axis: more})
+
+
+def moving(stage, earlier=0.0):
+    """Return a run of a stage that stood at the highest voltages for some seconds, if at all."""
+    run, n = AxesRun(stage, AXES), round(earlier * RATE)
+    if n:
+        way = np.linspace(0.0, 10.0, 500)
+        before = np.concatenate([way, np.full(n, 10.0), way[::-1]])
+        run.process(np.stack([before] * 2), np.arange(before.size) / RATE)
+    return run
+
+
+def answer(stage, v, earlier=0.0):
+    """Return what a stage of this past does under voltages of both axes, a row each [m]."""
+    return moving(stage, earlier).process(v, np.arange(v.shape[1]) / RATE)
 
 
 def sweeps(n, rng, turns=40):

@@ -94,11 +94,13 @@ class AxisComparison:
         numbers, (low, high) = v[np.isfinite(v)], self._ends
         self._ends = float(numbers.min(initial=low)), float(numbers.max(initial=high))
 
-    def predicted(self, prediction: Samples, voltage: Samples, known: bool) -> None:
-        """Take a prediction, its voltage, and whether the memory was known before it."""
+    def predicted(
+        self, prediction: Samples, voltage: Samples, known: bool, felt: Array | float = 0.0
+    ) -> None:
+        """Take a prediction; see `Corrector.predicted`."""
         self._predicted += prediction.t.size
         self._compare(self.matcher.predicted(prediction))
-        self._correct(self.corrector.predicted(prediction, voltage, known))
+        self._correct(self.corrector.predicted(prediction, voltage, known, felt))
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement."""

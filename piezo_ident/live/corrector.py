@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Estimate the displacement of a running stage from its prediction and earlier displacement.
+Estimate the displacement of a running axis from its prediction and earlier displacement.
+
+The part that the axis feels of other axes is taken off prediction and displacement, and added to
+the estimate: gain, hysteresis and creep are those of the motion by its own voltage.
 
 An observer corrects a sample of the prediction by displacement at least a horizon earlier.  The
 sample waits until this displacement has come or is known to be missing.  It is missing if later
@@ -78,11 +81,12 @@ class Estimated:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """A waiting block of prediction, with its first tick and its voltage."""
+    """A waiting block: first tick, prediction, voltage, and what is felt of other axes [m]."""
 
     tick: int
     prediction: Samples
     v: Array
+    felt: Array
 
 
 class Corrector:
@@ -228,19 +232,25 @@ class Corrector:
         # the next tick of the voltage, the newest tick with displacement, and the newest tick
         # whose displacement has come or is given up
         self._next, self._told, self._decided = 0, -1, -1
-        self._last: tuple[float, float] | None = None
+        self._last: Array | None = None
+        # what was felt of other axes, a horizon before the next sample
+        self._felt = np.zeros(self._horizon)
         # see `Estimated.is_settled`
         self._is_settled = True
 
-    def predicted(self, prediction: Samples, voltage: Samples, known: bool) -> list[Estimated]:
+    def predicted(
+        self, prediction: Samples, voltage: Samples, known: bool, felt: Array | float = 0.0
+    ) -> list[Estimated]:
         """
         Take the prediction for the last samples of a block of voltage; return finished estimates.
 
-        `known` says whether the run knew the outputs of the plays before the first block.
+        `known` says whether the run knew the outputs of the plays before the first block; `felt`
+        is the part of the prediction that other axes cause [m].
         """
         if self._model is None:
             return []
-        t, v = prediction.t, voltage.values[-prediction.t.size :].astype(np.float64)
+        t, y = prediction.t, prediction.values
+        rows = np.stack(np.broadcast_arrays(voltage.values[-t.size :], y, felt))
         before = self._clock.period
         kind, missing = self._clock.judge(t)
         period = self._clock.period
@@ -264,15 +274,16 @@ class Corrector:
             )
         elif kind is Kind.GAP and self._last is not None:
             # the predictor bridged this gap by a straight line, too
-            ends = zip(self._last, (float(v[0]), float(prediction.values[0])), strict=True)
-            between, y = (line_between(x, now, missing) for x, now in ends)
-            self._wait(Samples(np.full(missing, np.nan), y), between)
-        self._wait(prediction, v)
-        self._last = float(v[-1]), float(prediction.values[-1])
+            ends = zip(self._last.tolist(), rows[:, 0].tolist(), strict=True)
+            between = np.stack([line_between(*pair, missing) for pair in ends])
+            self._wait(Samples(np.full(missing, np.nan), between[1]), between)
+        self._wait(prediction, rows)
+        self._last = rows[:, -1]
         return self._estimates()
 
-    def _wait(self, prediction: Samples, v: Array) -> None:
-        self._waiting.append(_Block(self._next, prediction, v))
+    def _wait(self, prediction: Samples, rows: Array) -> None:
+        v, _, felt = rows
+        self._waiting.append(_Block(self._next, prediction, v, felt))
         self._next += v.size
 
     def measured(self, t: Array, y: Array) -> list[Estimated]:
@@ -302,6 +313,8 @@ class Corrector:
                 here = (ticks >= first) & (ticks < end)
                 y[ticks[here] - first] = values[here]
             self._measured = [part for part in self._measured if part[0][-1] >= end]
+            felt = np.append(self._felt, block.felt)
+            y, self._felt = y - felt[: y.size], felt[y.size :]
             free = self._learnt_run(block, y)
             seen = self._observer.process(block.v, free, y)
             self._is_settled = bool(np.ptp(seen.band) <= SETTLED * self.span)
@@ -309,13 +322,13 @@ class Corrector:
                 # the voltage in a gap is unknown
                 self._observer.lose_memory()
                 continue
-            samples = replace(block.prediction, values=seen.estimate)
+            samples = replace(block.prediction, values=seen.estimate + block.felt)
             done.append(Estimated(samples, seen, self._tell(samples.t, seen), self._is_settled))
         return done
 
     def _learnt_run(self, block: _Block, y: Array) -> Array:
         """Run the learnt model freely; it learns from displacement y a horizon before."""
-        free = block.prediction.values
+        free = block.prediction.values - block.felt
         ticks = np.arange(block.tick, block.tick + free.size, dtype=np.float64)
         t = self._clock.begin + ticks * self._clock.period
         if self._adaptation is not None:

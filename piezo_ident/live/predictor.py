@@ -50,6 +50,11 @@ class AxesRun:
     axes : sequence of str
         Order of the rows, by the names of the displacements; all axes of the model.
 
+    Attributes
+    ----------
+    felt : ndarray, shape (k, n)
+        Part of the last displacements that is felt of the other axes [m].
+
     Examples
     --------
     >>> import piezo_ident as pi
@@ -67,6 +72,7 @@ class AxesRun:
         self._coupled = {
             axis: x.stream() for axis, x in whole.items() if x.effects != single[axis].effects
         }
+        self.felt = np.zeros((len(axes), 0))
 
     def recall(self, pasts: Sequence[History], period: float) -> None:
         """Come into the state after the voltages so far; `pasts` has one history a row."""
@@ -79,16 +85,17 @@ class AxesRun:
 
     def process(self, v: Array, t: Array) -> Array:
         """Compute the displacements [m] of the next voltages [V], shapes (k, n); t is in s."""
-        y = [run.process(row, t) for run, row in zip(self._alone.values(), v, strict=True)]
+        own = [run.process(row, t) for run, row in zip(self._alone.values(), v, strict=True)]
+        y = own[0][np.newaxis] if len(own) == 1 else np.stack(own)
+        self.felt = np.zeros(y.shape)
         if not self._coupled:
-            return y[0][np.newaxis] if len(y) == 1 else np.stack(y)
-        moved = {motion_of(axis): row for axis, row in zip(self._alone, y, strict=True)}
-        return np.stack(
-            [
-                self._coupled[axis].process(v[k], t, moved) if axis in self._coupled else y[k]
-                for k, axis in enumerate(self._alone)
-            ]
-        )
+            return y
+        moved = {motion_of(axis): row for axis, row in zip(self._alone, own, strict=True)}
+        for k, axis in enumerate(self._alone):
+            if axis in self._coupled:
+                y[k] = self._coupled[axis].process(v[k], t, moved)
+                self.felt[k] = y[k] - own[k]
+        return y
 
 
 def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
@@ -131,6 +138,8 @@ class Predictor:
         The last problem of the stream; empty without one.
     half_width : Samples or None
         Half width of the band of the last block [m]; None if the model carries no band.
+    felt : ndarray, shape (k, n)
+        Part of the last prediction that each axis feels of the others [m].
     """
 
     def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:
@@ -138,6 +147,7 @@ class Predictor:
         self.model: StageModel | MultiAxisModel | None = None
         self.problem = ''
         self.half_width: Samples | None = None
+        self.felt = np.zeros((len(self._axes), 0))
         self._level = level
         self._clock = BlockClock()
         self._clear()
@@ -321,7 +331,9 @@ class Predictor:
                 self.problem = str(error)
                 return None
             self._run = AxesRun(model, self._axes)
-        return self._run.process(v, t)
+        y = self._run.process(v, t)
+        self.felt = self._run.felt
+        return y
 
     def _remember(self, t: Array, v: Array) -> None:
         for k, past in enumerate(self._pasts):

@@ -402,3 +402,17 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """List the model of each axis without the paths of the others."""
     return {'y': model} if isinstance(model, StageModel) else {a: model.own(a) for a in model.axes}
+
+
+def with_own(
+    model: StageModel | MultiAxisModel, own: Mapping[str, StageModel]
+) -> StageModel | MultiAxisModel:
+    """Replace the models of `alone`, which keep their effects; the paths stay as they are."""
+    if isinstance(model, StageModel):
+        return own['y']
+    axes = {}
+    for axis, x in model.axes.items():
+        effects = iter(own[axis].effects)
+        kept = tuple(e if e.channel.startswith(MOTION) else next(effects) for e in x.effects)
+        axes[axis] = replace(own[axis], effects=kept)
+    return replace(model, axes=axes)

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.fitting.adaptation import Recalled
 from piezo_ident.live.comparison import AxisComparison, finite_readings
 from piezo_ident.live.corrector import Corrector
@@ -20,7 +20,7 @@ from piezo_ident.live.join import Join
 from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
 from piezo_ident.live.predictor import AxesRun, Predictor, warm_up
-from piezo_ident.model.multi_axis import alone, models_of
+from piezo_ident.model.multi_axis import alone, models_of, with_own
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
 from piezo_ident.nodes.parameter_node import home_problem
@@ -47,7 +47,6 @@ class ModelNode(LabNode):
         super().__init__(**kwargs)
         warm_up()
         self._tails = self.tails()
-        self._refuse_adaptation(self.values)
         axes = [f'y{tail}' for tail in self._tails]
         self._predictor = Predictor(axes, self.values['interval'])
         self._join, self._looks = Join(self._tails[1:]), Looks()
@@ -68,10 +67,9 @@ class ModelNode(LabNode):
         }
         self._joints = self.create_publisher(JointState, 'preview', PREVIEW)
         self._comparisons = {tail: self._comparison(tail) for tail in self._tails}
-        self._corrector = self._comparisons[''].corrector
         self.offer('accept', self._accept)
         self.offer('save', self._save)
-        self.offer('restore', self._corrector.restore)
+        self.offer('restore', self._restore)
         self._loader = ModelLoader(self, _tried, self._take_model, self._report_state)
         if path := self.values['model']:
             self._loader.begin_with(path)
@@ -97,18 +95,10 @@ class ModelNode(LabNode):
         on_message = functools.partial(self._on_block, what, tail)
         return self.create_subscription(Float64MultiArray, f'{what}{tail}', on_message, STREAM)
 
-    def _refuse_adaptation(self, values: Mapping[str, Any]) -> None:
-        if self._tails[1:] and values['adapt'] != 'off':
-            raise ConfigError(
-                "adapt learns a model of one axis; set it to 'off', or leave axes out"
-            )
-
     # models
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a missing model file; ``~/status`` reports faults inside a file."""
-        if name == 'adapt' and hasattr(self, '_tails'):
-            self._refuse_adaptation({'adapt': value})
         return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -147,11 +137,16 @@ class ModelNode(LabNode):
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
 
     def _save(self) -> str:
-        learnt, path = self._corrector.learnt, self.values['output']
+        each = self._comparisons.items()
+        learnt, path = {f'y{k}': x.corrector.learnt for k, x in each}, self.values['output']
         if not path:
             raise DataError("parameter 'output' is empty; set it to the file to write")
-        learnt.save(Path(path).expanduser())
+        if (model := self._predictor.model) is not None:
+            with_own(model, learnt).save(Path(path).expanduser())
         return f'{path}: the model with what was learnt'
+
+    def _restore(self) -> str:
+        return self._joined({k: x.corrector.restore() for k, x in self._comparisons.items()})
 
     def _accept(self) -> str:
         said, refused = [], []
@@ -200,12 +195,12 @@ class ModelNode(LabNode):
             self._voltage(samples)
 
     def _voltage(self, samples: Samples) -> None:
-        predictor = self._predictor
+        predictor, each = self._predictor, self._comparisons.values()
         predictor.problem, known = '', predictor.memory_known
         prediction = predictor.process(samples)
         if self._is_lost:
             # the earlier error says nothing about the present
-            for one in self._comparisons.values():
+            for one in each:
                 one.error.clear()
         self._count += samples.t.size
         v, parts = np.atleast_2d(samples.values), []
@@ -222,8 +217,8 @@ class ModelNode(LabNode):
         if predictor.problem:
             self._note_problem(predictor.problem)
         self._is_silent &= prediction is None
-        for one, part, row in zip(self._comparisons.values(), parts, v, strict=False):
-            one.predicted(part, Samples(samples.t, row, samples.segment), known)
+        for one, part, row, felt in zip(each, parts, v, predictor.felt, strict=False):
+            one.predicted(part, Samples(samples.t, row, samples.segment), known, felt)
 
     def _displacement(self, tail: str, samples: Samples) -> None:
         numbers = finite_readings(samples)
