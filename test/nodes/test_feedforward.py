@@ -17,6 +17,8 @@ from std_msgs.msg import Float64MultiArray
 SIZE = 200
 #: how long a reference pauses before it has ended [s]
 SILENCE = 0.3
+#: a pause that a busy machine does not reach [s]
+PATIENT = 2.0
 #: H of a model that has no inverse
 FALLS = {'thresholds': [0.1], 'weights': [0.1], 'p1': -0.8, 'p2': 1.5}
 CREEP = {'name': 'creep', 'parameters': {'gain': [0.02], 'time_constant': [0.1]}}
@@ -160,6 +162,7 @@ def test_another_model_takes_over_while_the_stage_moves(lab):
 
 
 def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
+    assert lab.set('feedforward', 'silence', PATIENT)[0]
     armed(lab)
     voltage, since = lab.collect('voltage'), len(lab.statuses('feedforward'))
     first = len(voltage)
@@ -202,6 +205,7 @@ def test_what_is_wrong_with_a_reference_is_told_and_the_limits_hold(lab):
     assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
     assert v.min() >= 0.0 and v.max() <= 10.0
     assert np.abs(np.diff(v)).max() * FS <= 40_000.0 * (1 + 1e-9)
+    assert lab.set('feedforward', 'silence', SILENCE)[0]
 
 
 def test_one_drives_at_a_time(lab):
@@ -239,6 +243,7 @@ def test_programs_in_micrometres_are_a_reference(lab):
     limits = {'voltage_high': 100.0, 'ramp_slew': 500.0}
     # one reference at a time, too
     lab.unpublish('reference')
+    assert lab.set('feedforward', 'silence', PATIENT)[0]
     lab.start('excitation', {'quantity': 'reference', 'program': program, **limits})
     taken, why = lab.set(
         'excitation', 'program', program.replace('amplitude: 25', 'amplitude: 36')
@@ -253,6 +258,7 @@ def test_programs_in_micrometres_are_a_reference(lab):
     _, e = column([b for b in blocks if 'sine' in b.segment])
     assert e.size > 3000 and 100.0 * np.sqrt(np.mean(e**2)) / 50e-6 < 0.02
     assert lab.handle('excitation').stop() == 0
+    assert lab.set('feedforward', 'silence', SILENCE)[0]
 
 
 def test_a_reference_that_is_repeated_is_learned():
@@ -306,6 +312,7 @@ def test_a_gain_that_changed_is_made_up_for_on_request(lab):
         lab.wait(lambda n=x.size: sum(b.t.size for b in errors) >= n, 'the errors')
         e = column(errors)[1][int(FS) : x.size]
         assert least <= 100.0 * np.sqrt(np.mean(e**2)) / np.ptp(x) <= most
+    lab.wait(lambda: 'gain/value' in lab.diagnostics('feedforward'), 'the gain')
     assert float(lab.diagnostics('feedforward')['gain/value']) == pytest.approx(0.03, abs=2e-3)
     assert lab.set('feedforward', 'follow', 'off') == (True, '')
 
