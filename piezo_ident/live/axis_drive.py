@@ -172,8 +172,6 @@ class AxisDrive:
         if v.size:
             with self._lock:
                 self._past.add(t, v)
-            if self.follower is not None:
-                self.follower.drove(t, v)
         return t
 
     # another model

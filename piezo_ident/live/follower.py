@@ -5,7 +5,8 @@
 Correct a wanted motion by the measured error of a running stage.
 
 A stage differs from its model by an offset, creep and a gain.  The follower subtracts them from
-the wanted motion before the inverse of the model makes the voltage.
+the wanted motion before the inverse of the model makes the voltage.  Each of several axes has a
+follower of its motion by its own voltage.
 
 Corrections change at knots, which lie at fixed ticks of the voltage.  A knot follows from what the
 observer knew `LATE` before the newest voltage, so neither the cuts of the streams nor the delay of
@@ -93,14 +94,22 @@ class Follower:
         self._at, self._values = -1, np.zeros((2, 2))
         self.is_limited = False
 
-    def drove(self, t: Array, v: Array) -> None:
-        """Take the voltage [V] that was sent, with its time [s]; at least one sample."""
-        y, ticks = self._stream.process(v, t), self._next + np.arange(v.size)
+    def moved(self, t: Array, v: Array) -> Array:
+        """Return the motion by the next voltage [V] that was sent, at the times t [s]."""
+        return self._stream.process(v, t)
+
+    def drove(self, t: Array, v: Array, moved: Array, felt: Array) -> None:
+        """
+        Take the voltage [V] that was sent, at the times t [s]; at least one sample.
+
+        `moved` is the motion by this voltage, `felt` what the axis feels of others [m].
+        """
+        y, ticks = moved + felt, self._next + np.arange(v.size)
         self._next += v.size
         cuts = [0, *(np.flatnonzero(ticks[1:] % self._knot == 0) + 1).tolist(), v.size]
         for cut in (slice(*ends) for ends in itertools.pairwise(cuts)):
-            prediction, voltage = Samples(t[cut], y[cut]), Samples(t[cut], v[cut])
-            self._note(self.corrector.predicted(prediction, voltage, self._known))
+            both = Samples(t[cut], y[cut]), Samples(t[cut], v[cut])
+            self._note(self.corrector.predicted(*both, self._known, felt[cut]))
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement; NaN and samples ahead of the voltage are ignored."""

@@ -49,8 +49,8 @@ class Tracker:
     preview : int, optional
         Samples by which the stage follows the reference later.
     follow : {'off', 'offset', 'gain'}, optional
-        Corrections of a single axis by measured displacement: none, offset and creep from earlier
-        motion, or these and the gain of the stage.
+        Corrections of each axis by its measured displacement: none, offset and creep from earlier
+        motion, or these and the gain of the axis.
     axes : sequence of str, optional
         Order of the rows, by the names of the displacements.
 
@@ -82,8 +82,9 @@ class Tracker:
         single = alone(model)
         self._each = [AxisDrive(single[axis], settings, preview, follow) for axis in axes]
         self._paths = list[_Paths]()
+        self._felt: _Paths | None = None
         if isinstance(model, MultiAxisModel):
-            self._paths = [_Paths(model, axes) for _ in range(ROUNDS)]
+            *self._paths, self._felt = (_Paths(model, axes) for _ in range(ROUNDS + 1))
             rest = np.array([[one.inverse.position] for one in self._each])
             for one, shift in zip(self._each, self._paths[0].process(rest)[:, 0], strict=True):
                 one.rest_shift = float(shift)
@@ -93,13 +94,14 @@ class Tracker:
         """Begin at rest, with the clock of the voltages at zero."""
         for one in self._each:
             one.reset()
-        for paths in self._paths:
-            paths.reset()
+        for paths in (*self._paths, self._felt):
+            if paths is not None:
+                paths.reset()
 
     @property
-    def follower(self) -> Follower | None:
-        """What corrects the wanted motion; None if `follow` is ``'off'``."""
-        return self._each[0].follower
+    def followers(self) -> list[Follower]:
+        """What corrects the wanted motion of each axis; empty if `follow` is ``'off'``."""
+        return [one.follower for one in self._each if one.follower is not None]
 
     @property
     def rest(self) -> list[float]:
@@ -151,11 +153,22 @@ class Tracker:
             goals = wanted - paths.process(goals)
         drives = [one.drive(*x) for one, *x in zip(self._each, wanted, goals, strict=True)]
         v, now = (_rows([getattr(drive, x) for drive in drives]) for x in ('v', 'wanted'))
+        self._follow(drives[0].t, v)
         return Drive(drives[0].t, v, now, sum(drive.clipped for drive in drives))
 
-    def measured(self, samples: Samples) -> None:
-        """Take a block of displacement of the first axis [m], on the clock of the voltage."""
-        self._each[0].measured(samples)
+    def _follow(self, t: Array, v: Array) -> None:
+        """Tell the followers what was sent, and what each axis feels of the others."""
+        if not (followers := self.followers) or not t.size:
+            return
+        rows = np.atleast_2d(v)
+        moved = np.stack([one.moved(t, row) for one, row in zip(followers, rows, strict=True)])
+        felt = np.zeros(moved.shape) if self._felt is None else self._felt.process(moved)
+        for one, *of_axis in zip(followers, rows, moved, felt, strict=True):
+            one.drove(t, *of_axis)
+
+    def measured(self, samples: Samples, axis: int = 0) -> None:
+        """Take a block of displacement of an axis [m], on the clock of the voltage."""
+        self._each[axis].measured(samples)
 
     def finish(self) -> Drive:
         """Make the voltage for the rest of the reference, whose last sample is repeated."""
@@ -163,12 +176,16 @@ class Tracker:
 
     def play(self, v: Array) -> tuple[Array, Array]:
         """Send a given voltage of a single axis, limited; return its time and voltage."""
-        return self._each[0].play(v)
+        sent = self._each[0].play(v)
+        self._follow(*sent)
+        return sent
 
     def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
         """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
         ramps = [one.idle(n, longest) for one in self._each]
-        return ramps[0][0], _rows([v for _, v in ramps])
+        t, v = ramps[0][0], _rows([v for _, v in ramps])
+        self._follow(t, v)
+        return t, v
 
     def hurry(self) -> None:
         """Begin the ramps to rest anew, so that `idle` can shorten them."""

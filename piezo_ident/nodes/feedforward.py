@@ -15,11 +15,11 @@ the error stops falling.  A further call goes on from the best repetition.
 
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
 axes do to one another.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
-axes at the same t.  An axis without a reference stays at rest.  Such a stage is not learnt or
-followed.  Another model waits until the next ``~/start``.
+axes at the same t.  An axis without a reference stays at rest.  Such a stage is not learnt.
+Another model waits until the next ``~/start``.
 
-With `follow` an observer finds offset, creep of earlier motion, and gain in the displacement, and
-the node corrects the voltage by them.
+With `follow` an observer of each axis finds offset, creep of earlier motion, and gain in its
+displacement, and the node corrects the voltage by them.
 
 A refined model takes over while the stage moves.  The voltage does not step, and the model has the
 memory that it would have if it had run from the start.
@@ -121,8 +121,6 @@ class FeedforwardNode(DrivingNode):
         """Refuse limits that are crossed or in use, and a model file that is not there."""
         if name == 'model':
             return no_file(value)
-        if name == 'follow' and value != 'off' and any(self.wanted.get('axes', ())):
-            return "follow is for a stage of one axis; set it to 'off', or leave axes out"
         if name not in LIMITS or 'silence' not in self.values:
             return None
         if self._state in DRIVING:
@@ -299,7 +297,7 @@ class FeedforwardNode(DrivingNode):
         if self._learner is not None:
             self._learner.measured(samples)
         if self._tracker is not None:
-            self._tracker.measured(samples)
+            self._tracker.measured(samples, self._tails.index(tail))
 
     def _tell(self, errors: list[Samples]) -> None:
         for block in errors:
@@ -381,8 +379,9 @@ class FeedforwardNode(DrivingNode):
         if (tracker := self._tracker) is not None:
             values['delay'] = f'{tracker.preview / self._rate_of_clock:.6g}'
             values['passes'], values['expected'] = tracker.passes, f'{tracker.expected:.3g}'
-            if follower := tracker.follower:
-                values |= {name: f'{x:.6g}' for name, x in follower.corrector.told.items()}
+            for tail, follower in zip(self._tails, tracker.followers, strict=False):
+                told = follower.corrector.told.items()
+                values |= {f'{name}{tail}': f'{x:.6g}' for name, x in told}
                 if follower.is_limited:
                     self._faults.note('limited', LIMITED, 0)
         if rate:

@@ -171,10 +171,11 @@ def test_the_voltage_makes_up_for_creep_gain_and_zero(case, alone):
     assert rms(run_of('off', **case)[2]) > alone
     assert np.abs(np.diff(v)).max() <= SETTINGS.step * (1 + 1e-9)
     assert v.min() >= 0.0 and v.max() <= 10.0
-    assert tracker.follower.corrector.told['gain/value'] == pytest.approx(
+    (follower,) = tracker.followers
+    assert follower.corrector.told['gain/value'] == pytest.approx(
         case.get('gain', 1.0) - 1.0, abs=1e-3
     )
-    assert not tracker.follower.is_limited
+    assert not follower.is_limited
 
 
 @pytest.mark.parametrize('size', [37, 640])
@@ -195,7 +196,7 @@ def test_a_sensor_at_fault_moves_the_stage_by_a_tenth_of_its_stroke_at_most():
     tracker, v, error = run_of('gain', seconds=5.6, readings=lambda y: 60e-6 - 2.0 * y)
     span = 40e-6
     assert np.abs(error).max() < 100.0 * 0.105 * abs(CREEPS.scaling.Y) / span
-    assert tracker.follower.is_limited
+    assert tracker.followers[0].is_limited
     assert np.abs(np.diff(v)).max() <= SETTINGS.step * (1 + 1e-9)
 
 

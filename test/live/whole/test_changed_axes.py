@@ -6,13 +6,15 @@
 from dataclasses import replace
 import functools
 
-from axes_scanner import answer, AXES, creeping, ERRORS, grown, path, RATE, scanner
+from axes_scanner import answer, AXES, creeping, ERRORS, grown, moving, path, RATE, scanner
 import numpy as np
 from numpy.testing import assert_allclose
 import piezo_ident as pi
 from piezo_ident.live.comparison import AxisComparison
 from piezo_ident.live.corrector import Corrector
+from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.predictor import Predictor
+from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.multi_axis import alone, with_own
 from piezo_ident.model.observer import observe
 from piezo_ident.record.blocks import Samples
@@ -20,6 +22,7 @@ from piezo_ident.record.record import Piece
 import pytest
 
 N = 12_000
+LIMITS = GuardSettings(0.0, 10.0, 40e3, 200.0, 0.0, RATE)
 T = np.arange(N) / RATE
 
 
@@ -158,3 +161,38 @@ def test_what_each_axis_learns_is_one_model_with_the_same_paths(tmp_path):
     other = scan((3.0, 4.0))
     missed = answer(learnt, other) - answer(stage, other)
     assert (percents(missed, model) < 0.05).all()
+
+
+def tracked(follow, size=50, seconds=10.0, earlier=10.0):
+    """Track a scan of both axes; return the tracker, voltages, and errors [% of the span]."""
+    tracker = Tracker(creeping(), LIMITS, 60, follow, AXES)
+    run, t = moving(grown(creeping(), 'y_b'), earlier), np.arange(round(seconds * RATE)) / RATE
+    noise = noisy(np.zeros((2, t.size)))
+    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 0.7)])
+    wanted, parts = np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves), []
+    for k in range(0, t.size, size):
+        drive = tracker.process(wanted[:, k : k + size], k == 0)
+        y = run.process(drive.v, drive.t)
+        for i, row in enumerate(y + noise[:, k : k + size]):
+            tracker.measured(Samples(drive.t, row), i)
+        parts.append((drive.v, y - drive.wanted))
+    v, error = (np.hstack(rows) for rows in zip(*parts, strict=True))
+    return tracker, v, 100.0 * error / np.ptp(wanted, axis=1)[:, None]
+
+
+def test_each_axis_follows_its_reference_amid_creep_and_with_another_gain():
+    tracker, v, error = tracked('gain')
+    left, alone = (np.sqrt(np.mean(e[:, 5000:] ** 2, axis=1)) for e in (error, tracked('off')[2]))
+    assert alone[0] > 0.5 and alone[1] > 1.0
+    assert left.max() < 0.1
+    gains = [one.corrector.told['gain/value'] for one in tracker.followers]
+    assert gains == pytest.approx([0.0, 0.03], abs=1e-3)
+    assert v.min() >= LIMITS.low and v.max() <= LIMITS.high
+    assert np.abs(np.diff(v, axis=1)).max() <= LIMITS.step * (1 + 1e-9)
+    while not tracker.is_at_rest:
+        tracker.idle(100)
+
+
+def test_how_the_streams_are_cut_does_not_matter_to_what_follows():
+    one, other = (tracked('gain', size, seconds=3.0) for size in (10, 37))
+    assert_allclose(one[1], other[1], rtol=0, atol=1e-9)

@@ -3,7 +3,7 @@
 
 """A stage of two axes that changed, on the graph: one axis creeps, one moves 3 % more."""
 
-from axes_scanner import answer, AXES, creeping, grown, RATE
+from axes_scanner import answer, AXES, creeping, grown, moving, RATE
 from graph import Graph
 import numpy as np
 import piezo_ident as pi
@@ -57,3 +57,62 @@ def test_the_model_node_learns_each_axis_and_saves_one_model(lab, tmp_path):
         assert after == pytest.approx(gain * before, rel=2e-3)
     ok, said = lab.call('model/restore')
     assert ok and 'y: ' in said and 'y_b: ' in said, said
+
+
+class Answering:
+    """Plays a stage of two axes that answers each block of its voltages."""
+
+    def __init__(self, lab):
+        self.lab, self.run = lab, moving(grown(creeping(), 'y_b'), earlier=10.0)
+        self.sent = {tail: lab.collect(f'voltage{tail}') for tail in ('', '_b')}
+        self.v, self.y, self.next = np.empty((2, 0)), np.empty((2, 0)), 0
+
+    def __call__(self):
+        """Answer what has come on both axes."""
+        while all(len(blocks) > self.next for blocks in self.sent.values()):
+            blocks = [blocks[self.next] for blocks in self.sent.values()]
+            self.next += 1
+            t, v = blocks[0].t, np.stack([block.values for block in blocks])
+            assert (t == blocks[1].t).all()
+            y = self.run.process(v, t)
+            self.v, self.y = np.hstack([self.v, v]), np.hstack([self.y, y])
+            for tail, row in zip(self.sent, y, strict=True):
+                topic = f'displacement{tail}'
+                self.lab.publish(topic, Samples(t, row, blocks[0].segment, topic))
+
+
+def driving(lab, tmp_path, **options):
+    """Start a feedforward node with the model of both axes; return the stage."""
+    stage, path = Answering(lab), tmp_path / 'model.yaml'
+    creeping().save(path)
+    options = {'axes': ['b'], 'sample_rate': RATE, 'model': str(path), **options}
+    lab.start('feedforward', {'preview': 0.06, 'ramp_slew': 200.0, 'silence': 3.0, **options})
+    lab.wait(lambda: lab.status('feedforward').get('models') == '1', 'the model')
+    return stage
+
+
+def scan(lab, stage, wanted, size=50):
+    """Have the node follow a motion of both axes [m], a row each."""
+    assert lab.call('feedforward/start')[0]
+    lab.until('feedforward', 'ready')
+    for k in range(0, wanted.shape[1], size):
+        t = np.arange(k, k + size) / RATE
+        for tail, row in reversed([*zip(stage.sent, wanted, strict=True)]):
+            topic = f'reference{tail}'
+            lab.publish(topic, Samples(t, row[k : k + size], 'scan', topic))
+        lab.wait(lambda n=k + size: stage.y.shape[1] >= n, 'the voltages', meanwhile=stage)
+
+
+def test_the_feedforward_node_follows_each_axis(lab, tmp_path):
+    stage = driving(lab, tmp_path, follow='gain')
+    t = np.arange(6000) / RATE
+    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 1.5)])
+    wanted = np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves)
+    scan(lab, stage, wanted)
+    error = stage.y[:, 4000:6000] - wanted[:, 3940:5940]
+    assert (np.sqrt(np.mean(error**2, axis=1)) < 1e-3 * np.ptp(wanted, axis=1)).all()
+    lab.wait(lambda: 'gain/value_b' in lab.diagnostics('feedforward'), 'the gain')
+    assert float(lab.diagnostics('feedforward')['gain/value_b']) == pytest.approx(0.03, abs=2e-3)
+    lab.call('feedforward/stop')
+    lab.wait(lambda: not stage.v.size or (stage.v[:, -1] == 0.0).all(), 'rest', meanwhile=stage)
+    lab.until('feedforward', 'stopped')

@@ -128,8 +128,6 @@ def test_both_axes_follow_their_references(lab, identified):
     lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), 'slew': 1000.0})
     ok, said = lab.call('feedforward/learn')
     assert not ok and 'one axis' in said
-    ok, said = lab.set('feedforward', 'follow', 'offset')
-    assert not ok and 'one axis' in said
     sent = [lab.collect(topic) for topic in ('voltage', 'voltage_b')]
     errors, begin = lab.collect('tracking_error_b'), [len(blocks) for blocks in sent]
     assert lab.call('feedforward/start')[0]
