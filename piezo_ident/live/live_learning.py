@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Learn a repeated motion on a running stage.
+Learn a repeated motion on a running stage; arrays have a row for each axis.
 
 `LiveLearning` plans a repetition, takes its measurement, and plans the next one.  `Learner` plays
 the repetitions in real time.
@@ -10,20 +10,21 @@ the repetitions in real time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 import threading
 import time
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
-from piezo_ident.control.learning import Learning
+from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.tracker import Tracker
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
+from piezo_ident.verbs.invert import learn_axes
 
 #: wait at the first voltage before a repetition begins [s]
 SETTLE = 0.05
@@ -37,35 +38,46 @@ class LiveLearning:
 
     Attributes
     ----------
-    voltage : ndarray, shape (m,)
+    each : dict of str to Learning
+        By the names of the axes.
+    voltage : ndarray, shape (k, m)
         Voltage of the next repetition [V].  The guard makes the ramp from rest to its first value.
-    wanted : ndarray, shape (m,)
+    wanted : ndarray, shape (k, m)
         Wanted displacement at the same samples [m]; NaN before the motion.
     """
 
-    def __init__(self, model: StageModel, reference: Array, settings: GuardSettings) -> None:
+    def __init__(
+        self,
+        model: StageModel | MultiAxisModel,
+        reference: Array,
+        settings: GuardSettings,
+        axes: Sequence[str] = ('y',),
+    ) -> None:
         self.model, self.reference, self._settings = model, reference, settings
-        self._learning = Learning(
-            model, reference, limits=(settings.low, settings.high), slew=settings.slew
-        )
+        limits, rows = (settings.low, settings.high), dict(zip(axes, reference, strict=True))
+        each = learn_axes(model, rows, limits=limits, slew=settings.slew)
+        self.each = {axis: each[axis] for axis in axes}
         self.again()
 
     def again(self) -> None:
         """Plan a repetition."""
-        s, drive = self._settings, self._learning.drive
-        way = math.ceil(2.0 * abs(drive.v[0] - s.rest) / s.ramp_step)
+        s, drives = self._settings, [one.drive for one in self.each.values()]
+        lead = max(drive.lead for drive in drives)
+        v = np.stack([np.pad(x.v, (lead - x.lead, 0), mode='edge') for x in drives])
+        way = math.ceil(2.0 * np.abs(v[:, 0] - s.rest).max() / s.ramp_step)
         self._first = way + round(SETTLE * s.sample_rate)
-        self.voltage = np.append(np.full(self._first, drive.v[0]), drive.v)
+        before = (0, 0), (self._first, 0)
+        self.voltage = np.pad(v, before, mode='edge')
         # the reference itself: the motion of the drive holds the learnt correction
-        wanted = np.pad(self.reference, (drive.lead, 0), mode='edge')
-        self.wanted = np.append(np.full(self._first, np.nan), wanted)
-        self._measured = np.full(drive.v.size, np.nan)
+        wanted = np.pad(self.reference, ((0, 0), (lead, 0)), mode='edge')
+        self.wanted = np.pad(wanted, before, constant_values=np.nan)
+        self._measured: Array = np.full(v.shape, np.nan)
 
-    def measured(self, samples: Samples, tick: int) -> None:
-        """Take a block of displacement; `tick` is the first sample of the repetition."""
+    def measured(self, samples: Samples, tick: int, axis: int = 0) -> None:
+        """Take displacement of an axis; `tick` is the first sample of the repetition."""
         k = np.rint(samples.t * self._settings.sample_rate).astype(np.int64) - tick - self._first
-        inside = (k >= 0) & (k < self._measured.size)
-        self._measured[k[inside]] = samples.values[inside]
+        inside = (k >= 0) & (k < self._measured.shape[1])
+        self._measured[axis, k[inside]] = samples.values[inside]
 
     @property
     def is_complete(self) -> bool:
@@ -74,17 +86,24 @@ class LiveLearning:
 
     @property
     def errors(self) -> list[float]:
-        """The error of each repetition so far [% of stroke]."""
-        return [r.error for r in self._learning.repetitions]
+        """The error of each repetition so far, of the worst axis [% of stroke]."""
+        each = [[r.error for r in one.repetitions] for one in self.each.values()]
+        return [max(errors) for errors in zip(*each, strict=True)]
 
     @property
     def is_done(self) -> bool:
-        """Whether the error has stopped falling."""
-        return self._learning.is_done
+        """Whether the error has stopped falling on every axis."""
+        return all(one.is_done for one in self.each.values())
 
     def take(self) -> None:
         """Learn from the measured displacement, and plan the next repetition."""
-        self._learning.take(self._measured)
+        for (axis, one), y in zip(self.each.items(), self._measured, strict=True):
+            try:
+                one.take(y[-one.drive.v.size :])
+            except DataError as error:
+                if len(self.each) == 1:
+                    raise
+                raise DataError(f'{axis}: {error}') from error
         self.again()
 
 
@@ -136,10 +155,10 @@ class Learner:
         """Share of the repetitions that was played [%]."""
         return 100.0 * self._count / self._most
 
-    def measured(self, samples: Samples) -> None:
-        """Take a block of displacement."""
+    def measured(self, samples: Samples, axis: int = 0) -> None:
+        """Take a block of displacement of an axis."""
         if self.learning is not None and self._pace:
-            self.learning.measured(samples, self._tick)
+            self.learning.measured(samples, self._tick, axis)
             # the wait for a slow stage begins anew with each of its answers
             self._resting = time.monotonic()
 
@@ -163,7 +182,7 @@ class Learner:
                 self._resting = 0.0
                 done = ', '.join(f'{e:.3g}' for e in learning.errors[-5:])
                 self.text = f'repetition {self._count + 1}' + (f' after {done} %' if done else '')
-        elif self._sent < learning.voltage.size:
+        elif self._sent < learning.voltage.shape[1]:
             self._send(tracker, learning, self._pace.due())
             self._resting = now
         elif learning.is_complete and tracker.is_at_rest:
@@ -180,7 +199,7 @@ class Learner:
     def is_played(self) -> bool:
         """Whether a repetition was sent in full, so that the stage has to go to rest."""
         learning = self.learning
-        return bool(self._pace and learning and self._sent >= learning.voltage.size)
+        return bool(self._pace and learning and self._sent >= learning.voltage.shape[1])
 
     def _judge(self, learning: LiveLearning) -> None:
         errors = learning.errors
@@ -193,13 +212,13 @@ class Learner:
             )
 
     def _send(self, tracker: Tracker, learning: LiveLearning, due: int) -> None:
-        due = min(self._sent + due, learning.voltage.size)
+        due = min(self._sent + due, learning.voltage.shape[1])
         segment = f'learn:{len(learning.errors) + 1}'
         while self._sent < due:
             cut = slice(self._sent, min(due, self._sent + 10 * BLOCK_SIZE))
-            t, v = tracker.play(learning.voltage[cut])
-            wanted = learning.wanted[cut]
-            known = np.isfinite(wanted)
-            goal = Samples(t[known], wanted[known], segment, 'reference')
+            t, v = tracker.play(learning.voltage[:, cut])
+            wanted = learning.wanted[:, cut]
+            known = np.isfinite(wanted[0])
+            goal = Samples(t[known], wanted[:, known], segment, 'reference')
             self._play(Samples(t, v, segment), goal)
             self._sent = cut.stop

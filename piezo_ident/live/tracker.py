@@ -175,15 +175,16 @@ class Tracker:
         return self.process(np.repeat([[x] for x in self.rest], self.preview, axis=1))
 
     def play(self, v: Array) -> tuple[Array, Array]:
-        """Send a given voltage of a single axis, limited; return its time and voltage."""
-        sent = self._each[0].play(v)
-        self._follow(*sent)
-        return sent
+        """Send a given voltage, limited; return its time and voltage."""
+        rows = zip(self._each, np.atleast_2d(v), strict=True)
+        return self._sent([one.play(row) for one, row in rows])
 
     def idle(self, n: int, longest: float = np.inf) -> tuple[Array, Array]:
         """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
-        ramps = [one.idle(n, longest) for one in self._each]
-        t, v = ramps[0][0], _rows([v for _, v in ramps])
+        return self._sent([one.idle(n, longest) for one in self._each])
+
+    def _sent(self, parts: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+        t, v = parts[0][0], _rows([v for _, v in parts])
         self._follow(t, v)
         return t, v
 

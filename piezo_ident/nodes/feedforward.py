@@ -15,8 +15,8 @@ the error stops falling.  A further call goes on from the best repetition.
 
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
 axes do to one another.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
-axes at the same t.  An axis without a reference stays at rest.  Such a stage is not learnt.
-Another model waits until the next ``~/start``.
+axes at the same t.  An axis without a reference stays at rest.  Another model waits until the next
+``~/start`` or ``~/learn``.
 
 With `follow` an observer of each axis finds offset, creep of earlier motion, and gain in its
 displacement, and the node corrects the voltage by them.
@@ -54,7 +54,6 @@ from piezo_ident.live.reference import Reference, TrackingErrors
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import check_unit, Prepared, prepared, Tracker
 from piezo_ident.model.multi_axis import models_of
-from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.driving import DRIVING, DrivingNode, NOW
 from piezo_ident.nodes.lab_node import guard_settings, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
@@ -171,24 +170,21 @@ class FeedforwardNode(DrivingNode):
         return f'the stage follows the reference {delay:.4g} s later'
 
     def _learn(self) -> str:
-        model, settings = self._model, self._settings()
-        if self._tails[1:]:
-            raise ConfigError('~/learn is for a stage of one axis; start the node without axes')
-        kept = self._wanted.kept
-        if kept is None or not isinstance(model, StageModel):
+        kept, axes = self._wanted.kept, [f'y{tail}' for tail in self._tails]
+        if kept is None or self._model is None:
             raise ConfigError('there is no reference to repeat: call ~/start, and send one')
         if self._wanted.length > self.values['longest'] * self._rate_of_clock:
             raise ConfigError('the last reference is longer than is kept; raise longest')
         self._begin()
-        x, before = kept[0], self._learned
+        model, settings, before = self._model, self._settings(), self._learned
 
         def make() -> LiveLearning:
-            if before and before.model is model and np.array_equal(before.reference, x):
+            if before and before.model is model and np.array_equal(before.reference, kept):
                 return before
-            return LiveLearning(model, x, settings)
+            return LiveLearning(model, kept, settings, axes)
 
         self._learner = Learner(make, self.values['repetitions'], self._played)
-        return f'the last reference, {x.size / self._rate_of_clock:.3g} s, is repeated'
+        return f'the last reference, {kept.shape[1] / self._rate_of_clock:.3g} s, is repeated'
 
     def _begin(self) -> Tracker:
         """Take the right to drive."""
@@ -295,7 +291,7 @@ class FeedforwardNode(DrivingNode):
         self._answered = time.monotonic()
         self._tell(self._errors.measured(tail, samples))
         if self._learner is not None:
-            self._learner.measured(samples)
+            self._learner.measured(samples, self._tails.index(tail))
         if self._tracker is not None:
             self._tracker.measured(samples, self._tails.index(tail))
 

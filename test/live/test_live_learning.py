@@ -19,14 +19,15 @@ SETTINGS = GuardSettings(0.0, 10.0, 40e3, 200.0, 0.0, FS)
 def test_it_learns_from_blocks_of_any_clock_and_knows_when_they_are_complete():
     stage = replace(PAPER, effects=(EffectSetting('creep', VISIBLE['creep']),))
     reference = 35e-6 - 15e-6 * np.cos(np.arange(2000) / 100.0)
-    learning = LiveLearning(PAPER, reference, SETTINGS)
+    learning = LiveLearning(PAPER, reference[np.newaxis], SETTINGS)
     for tick in (0, 777, 5000):
         # the guard makes the way from rest
-        v = Guard(SETTINGS).process(learning.voltage).voltage
-        assert v[0] == 0.0 and v.size == learning.wanted.size
-        moving = np.isfinite(learning.wanted)
-        np.testing.assert_array_equal(learning.wanted[moving][-2000:], reference)
-        np.testing.assert_array_equal(v[moving], learning.voltage[moving])
+        (voltage,), (wanted,) = learning.voltage, learning.wanted
+        v = Guard(SETTINGS).process(voltage).voltage
+        assert v[0] == 0.0 and v.size == wanted.size
+        moving = np.isfinite(wanted)
+        np.testing.assert_array_equal(wanted[moving][-2000:], reference)
+        np.testing.assert_array_equal(v[moving], voltage[moving])
         y = stage.simulate(v)
         t = (tick + np.arange(v.size)) / FS
         # the last block comes first

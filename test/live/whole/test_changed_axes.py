@@ -13,6 +13,7 @@ import piezo_ident as pi
 from piezo_ident.live.comparison import AxisComparison
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.multi_axis import alone, with_own
@@ -196,3 +197,45 @@ def test_each_axis_follows_its_reference_amid_creep_and_with_another_gain():
 def test_how_the_streams_are_cut_does_not_matter_to_what_follows():
     one, other = (tracked('gain', size, seconds=3.0) for size in (10, 37))
     assert_allclose(one[1], other[1], rtol=0, atol=1e-9)
+
+
+def repeated(stage, wanted, most=6):
+    """Repeat a motion of both axes; return the learning, the voltages, and the last motion."""
+    learning, sent = LiveLearning(scanner(), wanted, LIMITS, AXES), []
+    while not learning.is_done and len(learning.errors) < most:
+        tracker = Tracker(scanner(), LIMITS, 60, axes=AXES)
+        t, v = tracker.play(learning.voltage)
+        y = stage.process(v, t)
+        for k, row in enumerate(noisy(y, len(sent))):
+            learning.measured(Samples(t, row), 0, k)
+        assert learning.is_complete
+        moved = y[:, -wanted.shape[1] :] - wanted
+        learning.take()
+        sent.append(v)
+        stage.process(*reversed(tracker.idle(3000)))
+    return learning, np.hstack(sent), moved
+
+
+def test_a_motion_of_all_axes_is_learnt_with_the_paths_made_up_for():
+    t = np.arange(2000) / RATE
+    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 2.0)])
+    wanted = np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves)
+    # the stage of the model is met at once, paths included
+    learning, _, _ = repeated(moving(scanner()), wanted, 1)
+    assert learning.errors[0] < 0.02
+    # one that creeps and moves more is not
+    learning, v, moved = repeated(moving(grown(creeping(), 'y_b')), wanted)
+    assert learning.errors[0] > 1.0 and min(learning.errors) < 0.1
+    assert (np.std(moved, axis=1) < 1e-3 * np.ptp(wanted, axis=1)).all()
+    assert v.min() >= LIMITS.low and v.max() <= LIMITS.high
+    assert np.abs(np.diff(v, axis=1)).max() <= LIMITS.step * (1 + 1e-9)
+
+
+def test_an_axis_that_nobody_moves_is_no_obstacle_to_learning():
+    t = np.arange(2000) / RATE
+    wanted = np.stack([20e-6 * (1.0 - 0.8 * np.cos(2 * np.pi * 3.0 * t)), np.zeros(t.size)])
+    # at its lowest voltage it cannot make up for what the first axis moves of it
+    learning, v, _ = repeated(moving(grown(scanner(), 'y')), wanted)
+    assert v[1].max() < 0.02
+    first = [r.error for r in learning.each['y'].repetitions]
+    assert first[0] > 1.0 and min(first) < 0.05

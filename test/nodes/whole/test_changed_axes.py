@@ -3,6 +3,8 @@
 
 """A stage of two axes that changed, on the graph: one axis creeps, one moves 3 % more."""
 
+import re
+
 from axes_scanner import answer, AXES, creeping, grown, moving, RATE
 from graph import Graph
 import numpy as np
@@ -86,7 +88,7 @@ def driving(lab, tmp_path, **options):
     stage, path = Answering(lab), tmp_path / 'model.yaml'
     creeping().save(path)
     options = {'axes': ['b'], 'sample_rate': RATE, 'model': str(path), **options}
-    lab.start('feedforward', {'preview': 0.06, 'ramp_slew': 200.0, 'silence': 3.0, **options})
+    lab.start('feedforward', {'preview': 0.06, 'ramp_slew': 200.0, 'silence': 2.0, **options})
     lab.wait(lambda: lab.status('feedforward').get('models') == '1', 'the model')
     return stage
 
@@ -116,3 +118,26 @@ def test_the_feedforward_node_follows_each_axis(lab, tmp_path):
     lab.call('feedforward/stop')
     lab.wait(lambda: not stage.v.size or (stage.v[:, -1] == 0.0).all(), 'rest', meanwhile=stage)
     lab.until('feedforward', 'stopped')
+
+
+def test_a_motion_of_both_axes_is_repeated_and_learnt(lab, tmp_path):
+    stage = driving(lab, tmp_path, repetitions=3)
+    t = np.arange(1000) / RATE
+    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 2.0)])
+    scan(lab, stage, np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves))
+
+    def done(since):
+        return [s for s in lab.statuses('feedforward')[since:] if s['state'] in ('done', 'failed')]
+
+    lab.wait(lambda: done(0), 'the end of the reference', meanwhile=stage)
+    since, sent = len(lab.statuses('feedforward')), stage.v.shape[1]
+    ok, said = lab.call('feedforward/learn')
+    assert ok and '1 s, is repeated' in said, said
+    lab.wait(lambda: done(since), 'the end of learning', meanwhile=stage)
+    told = done(since)[0]['text']
+    best, first = (float(x) for x in re.findall(r'([0-9.e-]+) %? ?(?:of|in)', told))
+    assert first > 1.0 and best < 0.1 * first, told
+    v = stage.v[:, sent:]
+    assert (np.ptp(v, axis=1) > 2.0).all() and v.min() >= 0.0 and v.max() <= 10.0
+    assert (v[:, -1] == 0.0).all()
+    assert np.abs(np.diff(v, axis=1)).max() * RATE <= 40e3 * (1 + 1e-9)

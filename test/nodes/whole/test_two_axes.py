@@ -126,8 +126,6 @@ def test_both_axes_follow_their_references(lab, identified):
     path = identified[1] / 'model.yaml'
     spans = {axis: x.scaling for axis, x in pi.load(path).axes.items()}
     lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), 'slew': 1000.0})
-    ok, said = lab.call('feedforward/learn')
-    assert not ok and 'one axis' in said
     sent = [lab.collect(topic) for topic in ('voltage', 'voltage_b')]
     errors, begin = lab.collect('tracking_error_b'), [len(blocks) for blocks in sent]
     assert lab.call('feedforward/start')[0]
