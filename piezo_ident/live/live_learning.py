@@ -88,7 +88,7 @@ class LiveLearning:
     def errors(self) -> list[float]:
         """The error of each repetition so far, of the worst axis [% of stroke]."""
         each = [[r.error for r in one.repetitions] for one in self.each.values()]
-        return [max(errors) for errors in zip(*each, strict=True)]
+        return [max(errors) for errors in zip(*each, strict=False)]
 
     @property
     def is_done(self) -> bool:
@@ -97,14 +97,17 @@ class LiveLearning:
 
     def take(self) -> None:
         """Learn from the measured displacement, and plan the next repetition."""
-        for (axis, one), y in zip(self.each.items(), self._measured, strict=True):
-            try:
+        try:
+            for axis, y in zip(self.each, self._measured, strict=True):
+                one = self.each[axis]
                 one.take(y[-one.drive.v.size :])
-            except DataError as error:
-                if len(self.each) == 1:
-                    raise
-                raise DataError(f'{axis}: {error}') from error
-        self.again()
+        except DataError as error:
+            if len(self.each) == 1:
+                raise
+            raise DataError(f'{axis}: {error}') from error
+        finally:
+            # the plan of the axes that have learnt has changed
+            self.again()
 
 
 class Learner:

@@ -239,3 +239,23 @@ def test_an_axis_that_nobody_moves_is_no_obstacle_to_learning():
     assert v[1].max() < 0.02
     first = [r.error for r in learning.each['y'].repetitions]
     assert first[0] > 1.0 and min(first) < 0.05
+
+
+def test_a_sensor_at_fault_ends_learning_with_the_name_of_its_axis():
+    t = np.arange(1000) / RATE
+    wanted = np.stack([15e-6 * (1.0 - 0.8 * np.cos(2 * np.pi * 3.0 * t))] * 2)
+    learning = LiveLearning(scanner(), wanted, LIMITS, AXES)
+    for broken in (True, False):
+        at = np.arange(learning.voltage.shape[1]) / RATE
+        y = answer(scanner(), learning.voltage)
+        for k, row in enumerate(y):
+            learning.measured(Samples(at, np.zeros(at.size) if broken and k else row), 0, k)
+        assert learning.is_complete
+        if broken:
+            with pytest.raises(pi.DataError, match='y_b: learning: the displacement stands'):
+                learning.take()
+        else:
+            # it goes on with what was sound
+            learning.take()
+            assert learning.errors[0] < 0.02
+        assert not learning.is_complete
