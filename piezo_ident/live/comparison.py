@@ -99,8 +99,9 @@ class AxisComparison:
     ) -> None:
         """Take a prediction; see `Corrector.predicted`."""
         self._predicted += prediction.t.size
-        self._compare(self.matcher.predicted(prediction))
+        # the corrector takes no displacement before the first prediction of its run
         self._correct(self.corrector.predicted(prediction, voltage, known, felt))
+        self._compare(self.matcher.predicted(prediction))
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement."""

@@ -52,22 +52,27 @@ class Live:
             2.0, Corrector(**options), publish, lambda told: None, lambda: True, print
         )
 
-    def play(self, v, y, size=50):
-        """Play both streams, the displacement a few blocks late; return the estimates."""
+    def play(self, v, y, size=50, late=3):
+        """Play both streams, the displacement some blocks late; return the estimates."""
         blocks = [slice(k, k + size) for k in range(0, N, size)]
-        for k, cut in enumerate([*blocks, *[None] * 3]):
-            if cut is not None:
-                known = self.predictor.memory_known
-                prediction = self.predictor.process(Samples(T[cut], v[:, cut]))
-                for i, one in enumerate(self.each):
-                    y_hat = replace(prediction, values=prediction.values[i])
-                    voltage = Samples(T[cut], v[i, cut])
-                    one.predicted(y_hat, voltage, known, self.predictor.felt[i])
-            if k >= 3:
-                late = blocks[k - 3]
-                for i, one in enumerate(self.each):
-                    one.measured(Samples(T[late], y[i, late], '', 'displacement'))
+        for k in range(len(blocks) + late):
+            acts = [(self._drove, k, v), (self._moved, k - late, y)]
+            for act, at, rows in acts if late else acts[::-1]:
+                if 0 <= at < len(blocks):
+                    act(blocks[at], rows)
         return np.stack([self._whole(axis, 'estimate') for axis in AXES])
+
+    def _drove(self, cut, v):
+        known = self.predictor.memory_known
+        prediction = self.predictor.process(Samples(T[cut], v[:, cut]))
+        for i, one in enumerate(self.each):
+            y_hat = replace(prediction, values=prediction.values[i])
+            voltage = Samples(T[cut], v[i, cut])
+            one.predicted(y_hat, voltage, known, self.predictor.felt[i])
+
+    def _moved(self, cut, y):
+        for i, one in enumerate(self.each):
+            one.measured(Samples(T[cut], y[i, cut], '', 'displacement'))
 
     def _whole(self, axis, what):
         return np.concatenate([x.values for x in self.got[axis, what]])
@@ -107,7 +112,9 @@ def test_each_axis_is_corrected_by_what_changed_of_it():
 def test_an_estimate_is_that_of_the_axis_alone_and_what_it_feels(options):
     model, v = creeping(), scan()
     y = noisy(answer(grown(model, 'y_b'), v, earlier=10.0))
-    estimates = [Live(model, **options).play(v, y, size) for size in (50, 77)]
+    # displacement a few blocks late, or before its voltage
+    plays = ((50, 3), (77, 3), (50, 0))
+    estimates = [Live(model, **options).play(v, y, size, late) for size, late in plays]
     free, own = answer(model, v), alone(model)
     for k, axis in enumerate(AXES):
         felt = free[k] - own[axis].simulate(v[k])
