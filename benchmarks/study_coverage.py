@@ -30,6 +30,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.record.record import Piece
 from piezo_ident.report.figures import style
 from piezo_ident.uncertainty.parameters import quantities_of
+from piezo_ident.uncertainty.prediction import half_widths
 from piezo_ident.uncertainty.weights import NOTHING
 from side_by_side import machine
 from study_records import case_records
@@ -41,6 +42,12 @@ SEED, GROUP = 9101, 'known'
 #: levels of the bands, and the one of the tables
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95)
 MAIN = LEVELS.index(0.9)
+#: heads of the widths, and what they mean
+WIDTHS = 'width / oracle, geometric'
+ORACLE = (
+    'The oracle is, for each stage and kind, the constant half width that holds 90 %. Width / '
+    'oracle: mean half width over the mean of the oracle, % of stroke; geometric: mean ratio.'
+)
 #: measured records and the share that is identified; the rest is predicted
 MEASURED = (('piezo_levels.csv', 0.6), ('piezo_1hz.csv', 0.86))
 DATA = Path(os.environ.get('PIEZO_IDENT_DATA', Path(__file__).parents[2] / '../shared/data'))
@@ -71,17 +78,17 @@ class Todo:
         return f'{self.what} {self.number}'
 
 
+#: a kind of motion of a record, the shares inside at `LEVELS`, the mean half width at 0.9 and the
+#: constant half width that holds 90 % [% of stroke], and the share of samples that are not known
+Cell = tuple[str, tuple[float, ...], float, float, float]
+
+
 @dataclass(frozen=True)
 class Covered:
-    """
-    What came out; errors in % of stroke.
-
-    `kinds` holds for each segment its kind, the shares inside at `LEVELS`, the mean half width at
-    0.9 over the half width that holds 90 %, and the share of samples that are not known.
-    """
+    """What came out; errors in % of stroke."""
 
     key: str
-    kinds: tuple[tuple[str, tuple[float, ...], float, float], ...] = ()
+    kinds: tuple[Cell, ...] = ()
     same: tuple[float, float] = (np.nan, np.nan)
     other: tuple[float, float] = (np.nan, np.nan)
     noise: float = np.nan
@@ -166,30 +173,32 @@ def _again(stage: FamilyStage, record: pi.Record) -> pi.Record:
     return pi.Record((again,), 'again')
 
 
-def _kinds(
-    model: pi.StageModel, record: pi.Record
-) -> Iterator[tuple[str, tuple[float, ...], float, float]]:
+def _kinds(model: pi.StageModel, record: pi.Record) -> Iterator[Cell]:
     """Yield the coverage of each kind of motion of a record, behind its unknown start."""
-    runs = [model.predict(record, level) for level in LEVELS]
-    for i, piece in enumerate(runs[0].record):
-        e = np.abs(piece.y - runs[0].pieces[i])
-        judged = piece.mask & (np.arange(piece.n) >= runs[0].late[i])
+    run = model.predict(record)
+    halves = [half_widths(model, run.record, run.pieces, level, run.estimated) for level in LEVELS]
+    rows: dict[str, list[np.ndarray]] = {}
+    for i, piece in enumerate(run.record):
+        e = np.abs([piece.y - run.pieces[i], *(half[i] for half in halves)])
+        judged = piece.mask & (np.arange(piece.n) >= run.late[i])
         for label, start, stop in [(s.label, s.start, s.stop) for s in piece.segments] or [
-            (f'part {k + 1}', k * piece.n // 8, (k + 1) * piece.n // 8) for k in range(8)
+            ('unlabelled', 0, piece.n)
         ]:
-            own = np.zeros(piece.n, dtype=bool)
-            own[start:stop] = judged[start:stop]
-            if own.sum() < 20:
-                continue
-            known = own & np.isfinite(runs[MAIN].half_widths[i])
-            unknown = 1.0 - known.sum() / own.sum()
-            kind = label.partition(':')[0].partition(' ')[0]
-            if not known.any():
-                yield kind, (), np.nan, unknown
-                continue
-            inside = tuple(float(np.mean((e <= r.half_widths[i])[known])) for r in runs)
-            oracle = max(float(np.quantile(e[known], LEVELS[MAIN])), 1e-15)
-            yield kind, inside, float(runs[MAIN].half_widths[i][known].mean()) / oracle, unknown
+            own = judged[start:stop]
+            rows.setdefault(label.partition(':')[0], []).append(e[:, start:stop][:, own])
+    scale = 100.0 / record.stroke
+    for kind, parts in rows.items():
+        e, *half = np.hstack(parts)
+        known = np.isfinite(half[MAIN])
+        if e.size < 20:
+            continue
+        unknown = 1.0 - float(known.mean())
+        if not known.any():
+            yield kind, (), np.nan, np.nan, unknown
+            continue
+        inside = tuple(float(np.mean((e <= h)[known])) for h in half)
+        oracle = max(float(np.quantile(e[known], LEVELS[MAIN])), 1e-15)
+        yield kind, inside, scale * float(half[MAIN][known].mean()), scale * oracle, unknown
 
 
 # -- parameters ----------------------------------------------------------------------------------
@@ -237,22 +246,22 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _coverage(rows: Sequence[Covered]) -> Iterator[tuple[object, ...]]:
-    by_kind: dict[str, list[tuple[tuple[float, ...], float, float]]] = {}
+    by_kind: dict[str, list[Cell]] = {}
     for row in rows:
-        for kind, inside, ratio, unknown in row.kinds:
-            by_kind.setdefault(kind, []).append((tuple(inside), ratio, unknown))
+        for cell in row.kinds:
+            by_kind.setdefault(cell[0], []).append(cell)
     for kind, cells in {**by_kind, 'all': [c for own in by_kind.values() for c in own]}.items():
-        held = [c for c in cells if c[0]]
+        held = [c for c in cells if c[1]]
         if held:
-            shares = np.mean([c[0] for c in held], axis=0)
-            ratio = np.exp(np.mean(np.log([c[1] for c in held])))
-            lost = np.mean([c[2] for c in cells])
+            shares = np.mean([c[1] for c in held], axis=0)
+            width, oracle = np.array([c[2:4] for c in held]).T
             yield (
                 kind,
                 len(held),
                 *(f'{100 * s:.0f}' for s in shares),
-                f'{ratio:.2f}',
-                f'{lost:.0%}',
+                f'{width.mean() / oracle.mean():.2f}',
+                f'{np.exp(np.mean(np.log(width / oracle))):.2f}',
+                f'{np.mean([c[4] for c in cells]):.0%}',
             )
 
 
@@ -283,7 +292,7 @@ def page(rows: Sequence[Covered], parameters: Sequence[tuple[object, ...]], draw
         for what in ('identified', 'diagnosed')
     }
     measured = [r for r in rows if '.csv' in r.key and not r.error]
-    heads = 'motion, segments, ' + ', '.join(f'{100 * p:g} %' for p in LEVELS)
+    heads = 'motion, stages, ' + ', '.join(f'{100 * p:g} %' for p in LEVELS)
     parts = [
         '# Coverage',
         'Whether [bands, promises and weights](bands.md) hold on stages of families that the '
@@ -299,14 +308,11 @@ def page(rows: Sequence[Covered], parameters: Sequence[tuple[object, ...]], draw
     for what, own in groups.items():
         title = f'Prediction bands, {what} stages'
         parts.append(
-            section(title, f'{heads}, width / oracle, not known', _coverage(own))
-            + '\n\nWidth / oracle: mean half width at 90 % over the constant half width of the '
-            f'segment that holds 90 %, geometric mean. Stages below 60 %: {_low(own)}.'
+            section(title, f'{heads}, {WIDTHS}, not known', _coverage(own))
+            + f'\n\n{ORACLE} Stages below 60 %: {_low(own)}.'
         )
     parts.append(
-        section(
-            'Bands on measured records', f'{heads}, width / oracle, not known', _coverage(measured)
-        )
+        section('Bands on measured records', f'{heads}, {WIDTHS}, not known', _coverage(measured))
     )
     told = [
         (what, len(own), *(_spread([s[0] / s[1] for s in pairs]) for pairs in both))
@@ -349,7 +355,7 @@ def picture(rows: Sequence[Covered], target: Path) -> None:
     fig = style.figure(4.2, 5.2)
     axes = fig.subplots()
     axes.plot([0, 1], [0, 1], color=style.GREY, linewidth=0.8)
-    for kind, n, *shares, _, _ in _coverage([r for r in rows if not r.error]):
+    for kind, n, *shares, _, _, _ in _coverage([r for r in rows if not r.error]):
         values = [float(s) / 100.0 for s in shares]
         axes.plot(
             LEVELS,

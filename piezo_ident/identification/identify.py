@@ -143,8 +143,16 @@ def _identify(
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
     provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, runs))
+    # the steps fit an unknown start with plays, and H may be of another law: samples count from
+    # where the start is forgotten, as in `score`
     judged_runs = (
-        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)
+        JudgedRun(
+            p.run.record,
+            p.run.piece,
+            p.y_hat,
+            p.judged if fit.fit is not None else p.judged & p.run.known,
+            ~fitted,
+        )
         for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
     )
     result = replace(result, model=replace(model, identification=provenance))
