@@ -6,12 +6,12 @@ Bound the error of a free run by a half width that follows the motion.
 
 The scale of the error is
 
-    q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2,
+    q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2 + (c_N N)^2,
 
-in spans, with swing S and speed D of `piezo_ident.uncertainty.motion`.  The other kinds give the q
-of a kind k of K, and r_k^2 is its mean square of error over q.  Errors within a kind are alike, so
-a kind counts as one observation with the mean zero.  The half width at level p holds one more
-observation:
+in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  The other kinds
+give the q of a kind k of K, and r_k^2 is its mean square of error over q.  Errors of one kind are
+alike, so a kind counts as one observation with the mean zero.  The half width at level p holds one
+more observation:
 
     q lambda,        lambda = t_K((1 + p) / 2) sqrt(1 + 1/K) sqrt(mean r_k^2),
 
@@ -58,8 +58,8 @@ class PredictionBand:
 
     Attributes
     ----------
-    coefficients : ndarray, shape (3,)
-        c_0, c_S and c_D in spans.
+    coefficients : ndarray, shape (4,)
+        c_0, c_S, c_D and c_N in spans; a file without c_N has three.
     kinds : int
         Number of kinds of motion, K.
     ratio : float
@@ -74,9 +74,9 @@ class PredictionBand:
     speed: float
 
     def scale(self, motion: Array) -> Array:
-        """Compute q of swing and speed, shape (2, n)."""
-        c, (swing, speed) = self.coefficients, motion
-        return np.asarray(np.sqrt(c[0] ** 2 + (c[1] * swing) ** 2 + (c[2] * speed) ** 2))
+        """Compute q of swing, speed and nesting, shape (3, n)."""
+        squares = self.coefficients**2
+        return np.asarray(np.sqrt(squares[0] + squares[1:] @ motion[: squares.size - 1] ** 2))
 
     def factor(self, level: float) -> float:
         """Compute lambda, the half width over q at a level."""
@@ -96,7 +96,7 @@ class PredictionBand:
             c, kinds = np.array(data['coefficients'], dtype=np.float64), int(data['kinds'])
             band = cls(c, kinds, float(data['ratio']), float(data['speed']))
             is_sound = (
-                c.shape == (3,)
+                c.shape in ((3,), (4,))
                 and kinds > 0
                 and np.isfinite([*c, *list(vars(band).values())[2:]]).all()
             )

@@ -47,8 +47,8 @@ class Blocks:
     ----------
     square : ndarray, shape (blocks,)
         Mean squared error, normalised.
-    motion : ndarray, shape (blocks, 3)
-        Mean squares of 1, swing and speed.
+    motion : ndarray, shape (blocks, 4)
+        Mean squares of 1, swing, speed and nesting.
     kind : ndarray of int, shape (blocks,)
     fitted : ndarray of bool, shape (blocks,)
         Whether a fit used samples of the kind.
@@ -123,8 +123,8 @@ def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
     return max(1.0, float(e2[own].mean() / e2[use].mean()))
 
 
-def calibrated(blocks: Blocks) -> PredictionBand:
-    """Fit a band to blocks, and predict each kind from the others."""
+def calibrated(blocks: Blocks) -> tuple[PredictionBand, Array]:
+    """Fit a band to blocks, and predict each kind k from the others; r_k has shape (kinds,)."""
     every, ratios = np.ones(blocks.kind.size, dtype=bool), list[float]()
     whole = _coefficients(_raised(blocks, every), every)
     for k in range(blocks.kinds):
@@ -133,7 +133,8 @@ def calibrated(blocks: Blocks) -> PredictionBand:
         raised = _raised(blocks, rest)
         ratio = raised.square[own] / _square(_coefficients(raised, rest), blocks.motion[own])
         ratios.append(float(np.average(ratio, weights=blocks.weight[own])))
-    return PredictionBand(whole, blocks.kinds, math.sqrt(np.mean(ratios)), blocks.speed)
+    band = PredictionBand(whole, blocks.kinds, math.sqrt(np.mean(ratios)), blocks.speed)
+    return band, np.sqrt(ratios)
 
 
 def _raised(blocks: Blocks, chosen: Mask) -> Blocks:
@@ -150,13 +151,13 @@ def _square(c: Array, motion: Array) -> Array:
 
 
 def _coefficients(blocks: Blocks, chosen: Mask) -> Array:
-    """Fit c_0, c_S and c_D to the rms errors of the chosen blocks."""
+    """Fit c_0, c_S, c_D and c_N to the rms errors of the chosen blocks."""
     motion, square, kind = blocks.motion[chosen], blocks.square[chosen], blocks.kind[chosen]
     count = np.bincount(kind, minlength=blocks.kinds)
     weight = np.sqrt(1.0 / count[kind])
     level = 0.5 * float(np.average(np.log(square), weights=weight**2))
     largest = np.sqrt(np.maximum(motion.max(axis=0), 1e-12))
-    start = level - np.log(largest) - 0.5 * math.log(3.0)
+    start = level - np.log(largest) - 0.5 * math.log(largest.size)
 
     def missed(logs: Array) -> Array:
         q, e = (np.sqrt(x) * math.exp(-level) for x in (_square(np.exp(logs), motion), square))

@@ -2,14 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Describe motion sample by sample by its swing and its speed, with which free runs err more.
+Describe motion sample by sample by its swing, speed and nesting, with which free runs err more.
 
 - Swing: the distance between the last two turning points of the voltage, or from the last of them
   to the voltage, whichever is larger.  The misfit of H grows with the loop that is travelled.
 - Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
   of G.  The misfit of G and of the delay grows with it.
 
-Swing and speed follow from the past alone, so a stream gives the same values as a whole record.
+- Nesting: the square of the mean of one minus swing, over about the last `MEMORY` of path.  Small
+  loops inside a wide one do not close on many stages: they drift along their path, and a sum of
+  plays predicts closed loops.  The square keeps loops of half the range out of it (taste).
+
+All follow from the past alone, so a stream gives the same values as a whole record.
 """
 
 from __future__ import annotations
@@ -22,13 +26,15 @@ from piezo_ident.model.stage_model import StageModel
 #: way back after which an extreme of the voltage counts as a turning point, as a share of the
 #: range (taste).  Noise of a measured voltage is smaller, and loops whose error matters are larger
 TURN = 2e-3
+#: path over which small loops drift, in ranges of the voltage (taste)
+MEMORY = 1.0
 #: shortest and longest time in which the speed of the past fades [samples, s]; taste
 FEWEST, LONGEST = 10.0, 0.1
 
 
 class Motion:
     """
-    Swing and speed of a stream of samples.
+    Swing, speed and nesting of a stream of samples.
 
     Parameters
     ----------
@@ -61,14 +67,14 @@ class Motion:
 
         Returns
         -------
-        ndarray, shape (2, n)
-            Swing, normalised, and speed [spans/s].
+        ndarray, shape (3, n)
+            Swing, normalised, speed [spans/s], and nesting.
         """
-        out = np.empty((2, u.size))
+        out = np.empty((3, u.size))
         if not u.size:
             return out
         if self._state is None:
-            self._state = np.array([1.0, u[0], u[0], u[0], 0.0, x[0]])
+            self._state = np.array([1.0, u[0], u[0], u[0], 0.0, x[0], 0.0])
         _described(u, x, TURN, self._fades, self._rate, self._state, out)
         return out
 
@@ -77,15 +83,19 @@ class Motion:
 def _described(
     u: Array, x: Array, turn: float, fades: float, rate: float, state: Array, out: Array
 ) -> None:
-    """Write swing and speed into `out`; the state is direction, extreme, two turns, speed, x."""
-    rising, extreme, last, before, speed, past = state
+    """Write swing, speed and nesting; state: direction, extreme, two turns, speed, x, small."""
+    rising, extreme, last, before, speed, past, small = state
     for k in range(u.size):
+        way = abs(u[k] - extreme)
         if (u[k] - extreme) * rising >= 0.0:
             extreme = u[k]
         elif (extreme - u[k]) * rising > turn:
             before, last, extreme, rising = last, extreme, u[k], -rising
-        out[0, k] = max(abs(last - before), abs(u[k] - last))
+        else:
+            way = 0.0
+        swing = max(abs(last - before), abs(u[k] - last))
         speed = max(alive(speed * fades), abs(x[k] - past) * rate)
+        small += (max(1.0 - swing, 0.0) - small) * (1.0 - np.exp(-way / MEMORY))
         past = x[k]
-        out[1, k] = speed
-    state[:] = np.array([rising, extreme, last, before, speed, past])
+        out[0, k], out[1, k], out[2, k] = swing, speed, small**2
+    state[:] = np.array([rising, extreme, last, before, speed, past, small])

@@ -5,15 +5,16 @@
 Promise the error of another record, and give the model its prediction band.
 
 The promise for the same kinds of motion is the rms error of the model on its records, raised to
-the error of held-out samples.  The promise for motion of another kind is the rms of the scale of
-the band, times its ratio (`piezo_ident.uncertainty.band`).  The rms is over all pairs of a swing
-of one kind and a speed of another.
+the error of held-out samples.  The promise for motion of another kind is the scale q of the band
+times the ratio r_k (`piezo_ident.uncertainty.band`), both as geometric means: over all pairs of a
+swing, with its nesting, of one kind and a speed of another, and over all kinds.  About half of the
+kinds err more than this, where a mean square would be the error of the worst kind alone.
 
 After a diagnosis the errors are free-run errors of the refined model.  This model carries
 nothing that follows time alone, such as hum, drift and a wandering gain, so the records count them
 in full.
 
-Limits: both are rms values over the whole record, in % of the stroke of the records that they
+Limits: both are for the rms error over a whole record, in % of the stroke of the records that they
 come from.  The zero of the sensor does not count where it has clearly moved.
 """
 
@@ -49,8 +50,8 @@ def promised_identification(result: Identification, judged: Judged) -> Identific
     model, blocks = result.model, blocks_of(result.model, judged.runs)
     if blocks is None:
         return result
-    band = calibrated(blocks)
-    promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
+    band, ratios = calibrated(blocks)
+    promise = _promise(blocks, blocks, band, ratios, abs(model.scaling.Y), result.stroke)
     if not judged.tests_other_motion:
         promise = replace(promise, other=None)
     return replace(result, model=with_band(model, band), promise=promise)
@@ -68,8 +69,8 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     )
     if same is None or other is None:
         return result
-    band = calibrated(other)
-    promise = _promise(same, other, band, abs(model.scaling.Y), stroke)
+    band, ratios = calibrated(other)
+    promise = _promise(same, other, band, ratios, abs(model.scaling.Y), stroke)
     if result.changes:
         # the deviations belong to the given model
         known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
@@ -79,12 +80,13 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
 
 
 def _promise(
-    same: Blocks, other: Blocks, band: PredictionBand, span: float, stroke: float
+    same: Blocks, other: Blocks, band: PredictionBand, ratios: Array, span: float, stroke: float
 ) -> Promise:
     mean = float(np.average(same.square, weights=same.weight))
-    swing, speed = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2))
-    pairs = np.array([x.ravel() for x in np.meshgrid(swing, speed)])
-    expected = band.ratio * math.sqrt(float(np.mean(band.scale(pairs) ** 2)))
+    swing, speed, nesting = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2, 3))
+    k, m = (x.ravel() for x in np.indices((other.kinds, other.kinds)))
+    scales = band.scale(np.array([swing[k], speed[m], nesting[k]]))
+    expected = math.exp(float(np.mean(np.log(scales)) + np.mean(np.log(ratios))))
     return Promise(percent(span * math.sqrt(mean), stroke), percent(span * expected, stroke))
 
 

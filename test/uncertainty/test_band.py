@@ -21,7 +21,7 @@ from piezo_ident.uncertainty.motion import Motion
 from piezo_ident.verbs.predict import free_run
 import pytest
 
-BAND = PredictionBand(np.array([1e-3, 2e-3, 0.0]), 5, 1.0, 100.0)
+BAND = PredictionBand(np.array([1e-3, 2e-3, 0.0, 0.0]), 5, 1.0, 100.0)
 
 
 def banded(band=BAND, **changes):
@@ -61,17 +61,17 @@ def judged(error, labels=('sine:1', 'sine:2', 'noise', 'steps')):
     return JudgedRun('record', piece, y, use, ~use)
 
 
-@pytest.mark.parametrize('place', [0, 1, 2])
+@pytest.mark.parametrize('place', [0, 1, 2, 3])
 def test_calibration_finds_what_the_error_follows(place):
     rng = np.random.default_rng(1)
-    true = np.array([1e-4, 1e-5, 1e-8])
-    true[place] = [1e-3, 5e-3, 2e-4][place]
+    true = np.array([1e-4, 1e-5, 1e-8, 1e-5])
+    true[place] = [1e-3, 5e-3, 2e-4, 5e-3][place]
 
     def error(motion):
-        scale = np.sqrt(true[0] ** 2 + (true[1] * motion[0]) ** 2 + (true[2] * motion[1]) ** 2)
+        scale = np.sqrt(true[0] ** 2 + np.sum((true[1:, None] * motion) ** 2, axis=0))
         return scale * rng.standard_normal(scale.size)
 
-    band = calibrated(blocks_of(PAPER, [judged(error)]))
+    band, _ = calibrated(blocks_of(PAPER, [judged(error)]))
     assert band.kinds == 4
     assert band.coefficients[place] == pytest.approx(true[place], rel=0.15)
     assert band.ratio == pytest.approx(1.0, rel=0.5)
@@ -84,7 +84,7 @@ def test_kinds_without_fits_raise_the_error_of_fitted_kinds_and_not_the_other_wa
     worse = replace(run, predicted=run.piece.y - size * run.error)
     outside = np.arange(run.use.size) >= third
     swing = [
-        calibrated(blocks_of(PAPER, [replace(worse, held=held)])).scale(np.array([[1.0], [0.0]]))
+        calibrated(blocks_of(PAPER, [replace(worse, held=held)]))[0].scale(np.eye(3)[:, :1])
         for held in (outside, np.zeros_like(outside), ~outside)
     ]
     assert swing[0] == pytest.approx(1e-2, rel=0.15)
