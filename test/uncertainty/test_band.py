@@ -77,6 +77,30 @@ def test_calibration_finds_what_the_error_follows(place):
     assert band.ratio == pytest.approx(1.0, rel=0.5)
 
 
+def test_small_loops_inside_a_wide_one_are_nested_along_their_path():
+    wide, small = sine(5.0, 8000), 5.0 + 0.2 * np.sin(2.0 * np.pi * 50.0 * np.arange(8000) / FS)
+    u = PAPER.scaling.u(np.concatenate([wide, small]))
+    nesting = Motion(PAPER).follow(u, u)[2]
+    assert nesting[4000:8000].max() < 0.05
+    # twenty cycles are 1.6 ranges of path, and the mean has come to 1 - exp(-1.6) of 0.96
+    assert nesting[8400] < 0.1 and nesting[-1] == pytest.approx(0.59, abs=0.03)
+    # noise of a resting voltage is no path
+    still = 5e-4 * np.random.default_rng(0).uniform(-1.0, 1.0, 4000)
+    assert Motion(PAPER).follow(still, still)[2].max() < 0.01
+
+
+def test_the_ratio_of_a_band_is_the_rms_over_its_kinds():
+    band, ratios = calibrated(blocks_of(PAPER, [judged(lambda motion: 1e-3 * (1.0 + motion[0]))]))
+    assert ratios.shape == (band.kinds,)
+    assert band.ratio == pytest.approx(np.sqrt(np.mean(ratios**2)))
+
+
+def test_a_band_of_a_file_without_nesting_is_read():
+    old = {**BAND.to_dict(), 'coefficients': [1e-3, 2e-3, 0.0]}
+    motion = np.random.default_rng(0).random((3, 50))
+    np.testing.assert_allclose(PredictionBand.from_dict(old).scale(motion), BAND.scale(motion))
+
+
 def test_kinds_without_fits_raise_the_error_of_fitted_kinds_and_not_the_other_way():
     run = judged(lambda motion: 1e-3 * motion[0], ('triangle', 'noise', 'sine:slow', 'sine:fast'))
     third = run.piece.find('sine')[0].start
