@@ -199,7 +199,7 @@ def _loss(
 
 def _linearised(here: _Point, stretches: Sequence[Stretch]) -> Equations:
     """Compute the normal equations of all stretches, block by block."""
-    count = 1 + max(int(s.block.max()) for s in stretches)
+    count = 1 + max(int(s.block[-1]) for s in stretches)
     stage = here.stage
     p = stage.values.size
     A, b, total = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros(count)

@@ -7,15 +7,12 @@ Replicate a linearised fit without each of its blocks in turn.
 A residual that is correlated in time, or an error of the model, stays within its block, and so
 counts as one observation: H. R. Kuensch, "The jackknife and the bootstrap for general stationary
 observations", Annals of Statistics 17(3), 1989, doi:10.1214/aos/1176347265.  All parameters are in
-one set of equations, so the dependence between them is in each replicate.  Steps that follow each
-other use the equations of their own blocks only, with the values of the steps before them:
-W. K. Newey, "A method of moments interpretation of sequential estimators", Economics Letters
-14(2-3), 1984, doi:10.1016/0165-1765(84)90083-1.
+one set of equations, so the dependence between them is in each replicate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,43 +34,34 @@ class Linearised:
     Linearised equations ``A_k theta = b_k`` of blocks k at a stage.
 
     A and b have shapes (blocks, p, p) and (blocks, p); `prior` is the information before the fit,
-    shape (p, p).  `steps` are the blocks, shape (blocks,), and the values, shape (p,), of the
-    steps of the fit, in their order.
+    shape (p, p).
     """
 
     stage: Stage
     A: Array
     b: Array
     prior: Array
-    steps: Sequence[tuple[Mask, Mask]]
 
     @classmethod
-    def of(cls, fit: Fit, steps: Sequence[tuple[Mask, Mask]] = ()) -> Linearised:
-        """Take the equations of a fit; without steps it fitted all parameters together."""
-        A, b = fit.equations.A, fit.equations.b
-        every = np.ones(len(A), dtype=bool), np.ones(b.shape[1], dtype=bool)
-        return cls(fit.stage, A, b, fit.prior_weight(), steps or (every,))
+    def of(cls, fit: Fit) -> Linearised:
+        """Take the equations of a fit of all parameters together."""
+        return cls(fit.stage, fit.equations.A, fit.equations.b, fit.prior_weight())
 
     def replicates(self) -> Iterator[Stage]:
         """Yield the stage at `SHARE` of the way to the solution without each block in turn."""
-        values, every = self.stage.values, np.ones(len(self.A), dtype=bool)
-        whole = self._solution(every)
-        for k in np.flatnonzero(self.A.any(axis=(1, 2))):
-            step = self._solution(every & (np.arange(every.size) != k)) - whole
+        values, A, b = self.stage.values, self.A.sum(axis=0) + self.prior, self.b.sum(axis=0)
+        free = self.stage.free(values) & (np.diag(A) > 0.0)
+        whole = _solved(A, b, free)
+        for A_k, b_k in zip(self.A, self.b, strict=True):
+            if not A_k.any():
+                continue
+            step = np.zeros(values.size)
+            step[free] = _solved(A - A_k, b - b_k, free) - whole
             try:
                 yield self.stage.moved(values + SHARE * step)
             except ModelError:
                 # this far the linear equations do not reach
                 continue
-
-    def _solution(self, kept: Mask) -> Array:
-        """Solve the equations of the kept blocks, step by step, shape (p,)."""
-        free, step = self.stage.free(self.stage.values), np.zeros(self.b.shape[1])
-        for blocks, values in self.steps:
-            A = self.A[blocks & kept].sum(axis=0) + self.prior
-            own = values & free & (np.diag(A) > 0.0)
-            step[own] += _solved(A, self.b[blocks & kept].sum(axis=0) - A @ step, own)
-        return step
 
 
 def _solved(A: Array, b: Array, free: Mask) -> Array:

@@ -95,11 +95,8 @@ class PredictionBand:
         try:
             c, kinds = np.array(data['coefficients'], dtype=np.float64), int(data['kinds'])
             band = cls(c, kinds, float(data['ratio']), float(data['speed']))
-            is_sound = (
-                c.shape in ((3,), (4,))
-                and kinds > 0
-                and np.isfinite([*c, *list(vars(band).values())[2:]]).all()
-            )
+            is_known = np.isfinite([*c, band.ratio, band.speed]).all()
+            is_sound = c.shape in ((3,), (4,)) and kinds > 0 and is_known
         except (KeyError, TypeError, ValueError):
             is_sound = False
         if not is_sound:
@@ -111,10 +108,7 @@ def band_of(model: StageModel) -> PredictionBand:
     """Read the band of a model; raise ModelError if the model carries none."""
     data = model.identification.get(KEY)
     if not isinstance(data, Mapping):
-        raise ModelError(
-            'the model carries no prediction band: it was made by hand, or before bands were '
-            'kept; identify the stage again to get one'
-        )
+        raise ModelError('the model carries no prediction band; identify the stage again')
     return PredictionBand.from_dict(data)
 
 

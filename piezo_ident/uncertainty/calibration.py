@@ -33,8 +33,8 @@ from scipy.optimize import least_squares
 BLOCKS, SHORTEST = 80, 20
 #: smallest scale of the error in spans: a tenth of a bit of a 16 bit converter
 LEAST = 1.5e-6
-#: weight of the prior against one block (taste: it decides only coefficients that the blocks leave
-#: open).  Its coefficients are the error of all blocks over the largest value of the motion
+#: weight of the prior, the error of all blocks over the largest value of the motion, against one
+#: block (taste: it decides only coefficients that the blocks leave open)
 PRIOR = 1e-3
 
 
@@ -49,9 +49,8 @@ class Blocks:
         Mean squared error, normalised.
     motion : ndarray, shape (blocks, 4)
         Mean squares of 1, swing, speed and nesting.
-    kind : ndarray of int, shape (blocks,)
-    fitted : ndarray of bool, shape (blocks,)
-        Whether a fit used samples of the kind.
+    kind, fitted : ndarray of int, of bool, shape (blocks,)
+        Number of the kind, and whether a fit used samples of it.
     weight : ndarray, shape (blocks,)
         Number of samples.
     speed : float

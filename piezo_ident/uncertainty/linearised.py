@@ -1,12 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Linearise the free run of an identified model in all of its parameters together.
-
-The steps of labelled records keep their order: G follows from the small motion alone, and H from
-the triangles with this G.
-"""
+"""Linearise the free run of an identified model in all of its parameters together."""
 
 from __future__ import annotations
 
@@ -29,8 +24,8 @@ from piezo_ident.selection.judged import Judged, JudgedRun
 BLOCKS, MOST_ROWS = 30, 100_000
 #: most samples times parameters: a further second of processor time for each 1e8 or so
 MOST_WORK = 3e8
-#: kinds of segments that the steps of labelled records fit G and H to
-STEPS = ('step', 'settle', 'noise'), ('triangle',)
+#: kinds of segments that the steps of labelled records fit H and G to
+STEPS = 'triangle', 'noise'
 
 
 def linearised(result: Identification, judged: Judged) -> Linearised | None:
@@ -52,13 +47,7 @@ def linearised(result: Identification, judged: Judged) -> Linearised | None:
     # these equations hold the start constant
     if result.memories or stage.values.size * sum(r.use.size for r in runs) > MOST_WORK:
         return None
-    fitted = fit(stage, _stretches(model, runs), iterations=0)
-    of_G = np.arange(len(fitted.equations.A)) < BLOCKS
-    size = 0 if stage.dynamics.is_static else stage.dynamics.a.size + stage.dynamics.b.size
-    dynamics, offsets = np.zeros((2, stage.values.size), dtype=bool)
-    dynamics[stage.law.size : stage.law.size + size] = True
-    offsets[stage.law.size + size :][: stage.offsets.size] = True
-    return Linearised.of(fitted, ((of_G, dynamics | offsets), (~of_G, ~dynamics)))
+    return Linearised.of(fit(stage, _stretches(model, runs), iterations=0))
 
 
 def stage_of(model: StageModel, name: str, records: int = 1) -> Stage:
@@ -71,26 +60,22 @@ def stage_of(model: StageModel, name: str, records: int = 1) -> Stage:
 
 def _stretches(model: StageModel, runs: Sequence[JudgedRun]) -> list[Stretch]:
     """Take the samples that the steps fitted, each step in `BLOCKS` blocks of one size."""
-    sizes = [sum(int(_fitted(run, kinds).sum()) for run in runs) for kinds in STEPS]
-    every, before, found = max(1, -(-sum(sizes) // MOST_ROWS)), [0, 0], list[Stretch]()
+    size = {kind: max(1, sum(int(_fitted(run, kind).sum()) for run in runs)) for kind in STEPS}
+    every, before, found = -(-sum(size.values()) // MOST_ROWS), 0.0, list[Stretch]()
     for i, run in enumerate(runs):
-        n = run.use.size
-        use, block = np.zeros(n, dtype=bool), np.zeros(n, dtype=int)
-        for k, kinds in enumerate(STEPS):
-            own = _fitted(run, kinds)
-            block[own] = k * BLOCKS + (before[k] + np.arange(own.sum())) * BLOCKS // sizes[k]
-            before[k] += int(own.sum())
-            use |= own
-        use &= np.arange(n) // 20 % every == 0
+        own = {kind: _fitted(run, kind) for kind in STEPS}
+        count = before + sum((np.cumsum(x) / size[kind] for kind, x in own.items()), np.zeros(1))
+        before, n = float(count[-1]), run.use.size
+        use = np.any(list(own.values()), axis=0) & (np.arange(n) // 20 % every == 0)
         u, x = model.scaling.u(run.piece.v), model.scaling.x(run.piece.y)
+        block = np.minimum(count * BLOCKS, len(STEPS) * BLOCKS - 1).astype(int)
         found.append(Stretch(u, x, use, block, run.piece.sample_rate, i, i))
     return found
 
 
-def _fitted(run: JudgedRun, kinds: Sequence[str]) -> Mask:
-    """Mark the fitted samples in segments of some kinds."""
+def _fitted(run: JudgedRun, kind: str) -> Mask:
+    """Mark the fitted samples in segments of a kind."""
     own = np.zeros(run.use.size, dtype=bool)
-    for s in run.piece.segments:
-        if s.kind in kinds:
-            own[s.start : s.stop] = run.use[s.start : s.stop] & ~run.held[s.start : s.stop]
+    for s in run.piece.find(kind):
+        own[s.start : s.stop] = run.use[s.start : s.stop] & ~run.held[s.start : s.stop]
     return own

@@ -8,10 +8,8 @@ Describe motion sample by sample by its swing, speed and nesting, with which fre
   to the voltage, whichever is larger.  The misfit of H grows with the loop that is travelled.
 - Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
   of G.  The misfit of G and of the delay grows with it.
-
-- Nesting: the square of the mean of one minus swing, over about the last `MEMORY` of path.  Small
-  loops inside a wide one do not close on many stages: they drift along their path, and a sum of
-  plays predicts closed loops.  The square keeps loops of half the range out of it (taste).
+- Nesting: the squared mean of one minus swing over the last range of path (taste).  Small loops
+  inside a wide one drift on many stages, and a sum of plays closes them.
 
 All follow from the past alone, so a stream gives the same values as a whole record.
 """
@@ -26,8 +24,6 @@ from piezo_ident.model.stage_model import StageModel
 #: way back after which an extreme of the voltage counts as a turning point, as a share of the
 #: range (taste).  Noise of a measured voltage is smaller, and loops whose error matters are larger
 TURN = 2e-3
-#: path over which small loops drift, in ranges of the voltage (taste)
-MEMORY = 1.0
 #: shortest and longest time in which the speed of the past fades [samples, s]; taste
 FEWEST, LONGEST = 10.0, 0.1
 
@@ -95,7 +91,7 @@ def _described(
             way = 0.0
         swing = max(abs(last - before), abs(u[k] - last))
         speed = max(alive(speed * fades), abs(x[k] - past) * rate)
-        small += (max(1.0 - swing, 0.0) - small) * (1.0 - np.exp(-way / MEMORY))
+        small += (max(1.0 - swing, 0.0) - small) * (1.0 - np.exp(-way))
         past = x[k]
         out[0, k], out[1, k], out[2, k] = swing, speed, small**2
     state[:] = np.array([rising, extreme, last, before, speed, past, small])

@@ -5,14 +5,12 @@
 Promise the error of another record, and give the model its prediction band.
 
 The promise for the same kinds of motion is the rms error of the model on its records, raised to
-the error of held-out samples.  The promise for motion of another kind is the scale q of the band
-times the ratio r_k (`piezo_ident.uncertainty.band`), both as geometric means: over all pairs of a
-swing, with its nesting, of one kind and a speed of another, and over all kinds.  About half of the
-kinds err more than this, where a mean square would be the error of the worst kind alone.
+the error of held-out samples.  The promise for motion of another kind is the geometric mean of q
+times that of r_k (`piezo_ident.uncertainty.band`).  It is over all pairs of a swing, with its
+nesting, of one kind and a speed of another.  About half of the kinds err more.
 
-After a diagnosis the errors are free-run errors of the refined model.  This model carries
-nothing that follows time alone, such as hum, drift and a wandering gain, so the records count them
-in full.
+After a diagnosis the errors are those of the refined model.  It carries nothing that follows time
+alone, so hum, drift and a wandering gain count in full.
 
 Limits: both are for the rms error over a whole record, in % of the stroke of the records that they
 come from.  The zero of the sensor does not count where it has clearly moved.
