@@ -91,7 +91,7 @@ mirror: .venv/.demo
 # on where it was stopped; QUICK=1 for some minutes, which goes to build/
 coverage: .venv/.demo
 	.venv/bin/python benchmarks/study_coverage.py $(if $(QUICK),build/coverage.md --identified 6 \
-	    --diagnosed 1 --draws 10 --picture build/images/coverage.png,docs/coverage.md)
+	    --diagnosed 1 --draws 2 --picture build/images/coverage.png,docs/coverage.md)
 
 # how often a diagnosis is right, on stages that are sums of plays and on others: hours on two
 # cores; goes on where it was stopped; SAMPLE=60 for so many cases of each, drawn at random

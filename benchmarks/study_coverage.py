@@ -278,7 +278,7 @@ def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) ->
         'motion without labels. `make coverage` writes this page. This run: '
         f'**{len(groups["identified"])} identified stages, {len(groups["diagnosed"])} diagnosed '
         f'ones, {len(measured)} measured records, {draws} draws of parameters**, '
-        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 100. '
+        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 40. '
         f'{machine()}.',
         '![Nominal against measured coverage by kind of motion](images/coverage.png)',
     ]
@@ -292,7 +292,7 @@ def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) ->
         section('Bands on measured records', f'{heads}, {WIDTHS}, not known', _coverage(measured))
     )
     told = [
-        (what, len(own), *(_spread([s[0] / s[1] for s in pairs]) for pairs in both))
+        (what, len(own), *(_spread([s[0] / (s[1] or np.nan) for s in pairs]) for pairs in both))
         for what, own in {**groups, 'measured': measured}.items()
         for both in [([r.same for r in own], [r.other for r in own])]
     ]
@@ -343,7 +343,7 @@ def main() -> None:
     parser.add_argument('--picture', type=Path, default=Path('docs/images/coverage.png'))
     parser.add_argument('--identified', type=int, default=200, help='number of stages')
     parser.add_argument('--diagnosed', type=int, default=100, help='number of stages')
-    parser.add_argument('--draws', type=int, default=100, help='draws of parameters')
+    parser.add_argument('--draws', type=int, default=40, help='draws of each noise')
     parser.add_argument('--processes', type=int, default=os.cpu_count() or 1)
     parser.add_argument('--kept', type=Path, default=Path('build/coverage.jsonl'))
     args = parser.parse_args()
