@@ -84,9 +84,9 @@ class AxisDrive:
         """Begin at rest, with the clock of the voltage at zero."""
         self._guard, self._past = Guard(self._settings), History()
         self.inverse.reset()
-        start = self.inverse.position + self.rest_shift
-        self._raw = self._wanted = np.full(self._preview, start)
-        self._join = _Join(start, self._step())
+        self._start = self.inverse.position + self.rest_shift
+        self._raw = self._wanted = np.full(self._preview, self._start)
+        self._join = _Join(self._start, self._step())
         self.follower = self._new_follower()
 
     def _new_follower(self, stream: Stream | None = None) -> Follower | None:
@@ -146,7 +146,9 @@ class AxisDrive:
         driven = self.inverse.process(goal)
         v = self._guard.process(driven.v).voltage
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
-        return Drive(self._sent(v), v, now, int(np.count_nonzero(driven.clipped)))
+        # an axis that nobody moves has no reference that could be out of reach
+        clipped = int(np.count_nonzero(driven.clipped & (now != self._start)))
+        return Drive(self._sent(v), v, now, clipped)
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement [m], on the clock of the voltage."""

@@ -133,6 +133,15 @@ def test_all_axes_follow_their_references_with_the_paths_made_up_for():
     assert tracker.is_at_rest and tracker.idle(10)[1].tolist() == [[0.0] * 10] * 2
 
 
+def test_an_axis_that_nobody_moves_is_not_out_of_reach():
+    tracker, wanted = Tracker(scanner(), LIMITS, 60, axes=AXES), motions()
+    # what the first axis moves of it would take a voltage below the lowest
+    wanted[1] = tracker.rest[1]
+    drives = [tracker.process(wanted[:, k : k + 50], k == 0) for k in range(0, 3000, 50)]
+    assert sum(d.clipped for d in drives) == 0
+    assert np.ptp(simulated(np.hstack([d.v for d in drives]))[1]) > 1e-7
+
+
 def test_limits_and_slew_hold_on_every_axis():
     settings = GuardSettings(0.0, 6.0, 100.0, 20.0, 0.0, RATE)
     tracker, wanted = Tracker(scanner(), settings, 60, axes=AXES), 3.0 * motions()
