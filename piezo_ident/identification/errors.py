@@ -48,14 +48,22 @@ def key_of(run: Run) -> tuple[str, float]:
     return run.record, run.piece.start_time
 
 
-def fitted_memories(runs: Sequence[Run], model: StageModel) -> Memories:
-    """Collect the fitted memories at the starts of runs; runs that share a key have none."""
+def fitted_memories(runs: Sequence[Run], model: StageModel, law: str) -> Memories:
+    """
+    Collect the memories at the starts of runs; runs that share a key have none.
+
+    The steps fit them with plays.  For an H of another law they are estimated again.
+    """
     keys = [key_of(run) for run in runs]
-    return {
-        key: run.start(model.hysteresis.thresholds)
+    sought = {
+        key: run
         for key, run in zip(keys, runs, strict=True)
         if run.memory is not None and keys.count(key) == 1
     }
+    if law == 'plays':
+        return {key: run.start(model.hysteresis.thresholds) for key, run in sought.items()}
+    starts = {key: fit_start(model, run.piece, run.use) for key, run in sought.items()}
+    return {key: start for key, start in starts.items() if start is not None}
 
 
 def predictions_of(
@@ -136,7 +144,9 @@ def with_fine_plays(model: StageModel, excerpts: Sequence[Excerpt]) -> StageMode
     return replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
 
 
-def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float, float]:
+def fast_error(
+    model: StageModel, law: str, runs: Sequence[Run], memories: Memories | None = None
+) -> tuple[float, float]:
     """
     Compute the error on fast motion with a fine H, and the fast motion itself.
 

@@ -142,9 +142,10 @@ def _identify(
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
-    provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, runs))
-    # the steps fit an unknown start with plays, and H may be of another law: samples count from
-    # where the start is forgotten, as in `score`
+    known = fit.memories if data.labelled else None
+    fast = fast_error(judged, fit.hysteresis.law, runs, known)
+    provenance = _provenance(result, records, fast)
+    # samples count from where an unknown start is forgotten, as in `score`
     judged_runs = (
         JudgedRun(
             p.run.record,

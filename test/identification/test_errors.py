@@ -9,10 +9,11 @@ import numpy as np
 from paper_stage import PAPER as MODEL
 from paper_stage import STAGE
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.errors import fast_error
+from piezo_ident.identification.errors import fast_error, fitted_memories
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Piece, Record
 from programs import identification_program
 import pytest
 
@@ -55,3 +56,20 @@ def test_all_fast_motion_is_that_of_the_displacement(record):
     rms = np.sqrt(2.0 * spectrum[above].sum()) / piece.n
     # the filter is no brick wall
     assert fast == pytest.approx(100.0 * rms / np.ptp(piece.y), rel=0.1)
+
+
+def test_a_start_that_was_fitted_with_plays_is_estimated_again_for_another_law():
+    v = 5.0 + 5.0 * np.sin(2.0 * np.pi * np.arange(6000) / 2000.0)
+    r = MODEL.hysteresis.thresholds
+    piece = Piece(v, v, MODEL.sample_rate)
+    y = MODEL.predict_piece(piece, 0.5 - 0.5 * r)
+    record = Record((replace(piece, y=y),), 'record')
+    (run,) = runs_of([record], MODEL.sample_rate, MODEL.scaling)
+    run = replace(run, memory=lambda thresholds: 0.5 - thresholds)
+    [of_plays] = fitted_memories([run], MODEL, 'plays').values()
+    np.testing.assert_array_equal(of_plays, 0.5 - r)
+    [again] = fitted_memories([run], MODEL, 'preisach').values()
+    off = [np.abs(MODEL.predict_piece(piece, start) - y).max() for start in (again, of_plays)]
+    assert off[0] < 0.1 * off[1]
+    # runs that share a name and a time have no memory of their own
+    assert not fitted_memories([run, run], MODEL, 'preisach')
