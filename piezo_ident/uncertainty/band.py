@@ -9,16 +9,15 @@ The scale of the error is
     q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2 + (c_N N)^2,
 
 in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  The other kinds
-give the q of a kind k of K, and r_k^2 is its mean square of error over q.  Errors of one kind are
-alike, so a kind counts as one observation with the mean zero.  The half width at level p holds one
-more observation:
+give the q of a kind k of K, and r_k^2 is its mean square of error over q.  A further kind has each
+r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and A. Ramdas, J.
+Am. Stat. Assoc. 118(544), 2023, doi:10.1080/01621459.2022.2060112.  The half width at level p is
+q lambda sqrt(1 + 1/K), where lambda solves
 
-    q lambda,        lambda = t_K((1 + p) / 2) sqrt(1 + 1/K) sqrt(mean r_k^2),
+    mean_k erf(lambda / (sqrt(2) r_k)) = p.
 
-with the quantile t_K of Student's distribution with K degrees of freedom (W. Q. Meeker, G. J. Hahn
-and L. A. Escobar, Statistical Intervals, 2nd ed., 2017, section 4.7,
-doi:10.1002/9781118594841).  The share p counts samples over kinds of motion: a whole record may
-leave its band.
+The root stands for the error of the r_k; draws of 3 to 20 kinds so keep the level.  The share p
+counts samples over kinds of motion: a whole record may leave its band.
 
 Limits: the band holds for the stage as it was when the record was made, with the zero of its
 sensor.  Outside the excited range of the voltage it widens by the distance, as the slope of H is
@@ -41,7 +40,8 @@ from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.observer import BEYOND
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.uncertainty.motion import Motion
-from scipy.special import stdtrit
+from scipy.optimize import brentq
+from scipy.special import erf, erfinv
 
 #: entry of a model file, below `identification`
 KEY = 'prediction_band'
@@ -60,17 +60,14 @@ class PredictionBand:
     ----------
     coefficients : ndarray, shape (4,)
         c_0, c_S, c_D and c_N in spans; a file without c_N has three.
-    kinds : int
-        Number of kinds of motion, K.
-    ratio : float
-        Rms of the ratios r_k.
+    ratios : ndarray, shape (K,)
+        Ratios r_k of the kinds of motion.
     speed : float
         Highest speed of the records [spans/s].
     """
 
     coefficients: Array
-    kinds: int
-    ratio: float
+    ratios: Array
     speed: float
 
     def scale(self, motion: Array) -> Array:
@@ -82,21 +79,25 @@ class PredictionBand:
         """Compute lambda, the half width over q at a level."""
         if not 0.0 < level < 1.0:
             raise ConfigError(f'interval must lie between 0 and 1, got {level:g}')
-        quantile = float(stdtrit(self.kinds, 0.5 + 0.5 * level))
-        return quantile * math.sqrt(1.0 + 1.0 / self.kinds) * self.ratio
+        r, quantile = self.ratios, float(erfinv(level))
+        ends = 0.99 * quantile * r.min(), 1.01 * quantile * r.max()
+        half = brentq(lambda x: float(np.mean(erf(x / r))) - level, *ends)
+        return math.sqrt(2.0 * (1.0 + 1.0 / r.size)) * float(half)
 
     def to_dict(self) -> dict[str, Any]:
         """Convert to plain data for a model file."""
-        return {**vars(self), 'coefficients': self.coefficients.tolist()}
+        return {k: x.tolist() if isinstance(x, np.ndarray) else x for k, x in vars(self).items()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PredictionBand:
         """Read a band of a model file; raise ModelError if it is damaged."""
         try:
-            c, kinds = np.array(data['coefficients'], dtype=np.float64), int(data['kinds'])
-            band = cls(c, kinds, float(data['ratio']), float(data['speed']))
-            is_known = np.isfinite([*c, band.ratio, band.speed]).all()
-            is_sound = c.shape in ((3,), (4,)) and kinds > 0 and is_known
+            # an older file has their rms alone
+            ratios = data.get('ratios') or [data['ratio']] * int(data['kinds'])
+            c, r = (np.array(x, dtype=np.float64) for x in (data['coefficients'], ratios))
+            band = cls(c, r, float(data['speed']))
+            is_known = np.isfinite([*c, *r, band.speed]).all()
+            is_sound = c.shape in ((3,), (4,)) and r.size > 0 and r.min() > 0.0 and is_known
         except (KeyError, TypeError, ValueError):
             is_sound = False
         if not is_sound:

@@ -122,8 +122,8 @@ def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
     return max(1.0, float(e2[own].mean() / e2[use].mean()))
 
 
-def calibrated(blocks: Blocks) -> tuple[PredictionBand, Array]:
-    """Fit a band to blocks, and predict each kind k from the others; r_k has shape (kinds,)."""
+def calibrated(blocks: Blocks) -> PredictionBand:
+    """Fit a band to blocks, and predict each kind from the others."""
     every, ratios = np.ones(blocks.kind.size, dtype=bool), list[float]()
     whole = _coefficients(_raised(blocks, every), every)
     for k in range(blocks.kinds):
@@ -132,8 +132,7 @@ def calibrated(blocks: Blocks) -> tuple[PredictionBand, Array]:
         raised = _raised(blocks, rest)
         ratio = raised.square[own] / _square(_coefficients(raised, rest), blocks.motion[own])
         ratios.append(float(np.average(ratio, weights=blocks.weight[own])))
-    band = PredictionBand(whole, blocks.kinds, math.sqrt(np.mean(ratios)), blocks.speed)
-    return band, np.sqrt(ratios)
+    return PredictionBand(whole, np.sqrt(ratios), blocks.speed)
 
 
 def _raised(blocks: Blocks, chosen: Mask) -> Blocks:

@@ -48,8 +48,8 @@ def promised_identification(result: Identification, judged: Judged) -> Identific
     model, blocks = result.model, blocks_of(result.model, judged.runs)
     if blocks is None:
         return result
-    band, ratios = calibrated(blocks)
-    promise = _promise(blocks, blocks, band, ratios, abs(model.scaling.Y), result.stroke)
+    band = calibrated(blocks)
+    promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
     if not judged.tests_other_motion:
         promise = replace(promise, other=None)
     return replace(result, model=with_band(model, band), promise=promise)
@@ -67,8 +67,8 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     )
     if same is None or other is None:
         return result
-    band, ratios = calibrated(other)
-    promise = _promise(same, other, band, ratios, abs(model.scaling.Y), stroke)
+    band = calibrated(other)
+    promise = _promise(same, other, band, abs(model.scaling.Y), stroke)
     if result.changes:
         # the deviations belong to the given model
         known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
@@ -78,13 +78,13 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
 
 
 def _promise(
-    same: Blocks, other: Blocks, band: PredictionBand, ratios: Array, span: float, stroke: float
+    same: Blocks, other: Blocks, band: PredictionBand, span: float, stroke: float
 ) -> Promise:
     mean = float(np.average(same.square, weights=same.weight))
     swing, speed, nesting = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2, 3))
     k, m = (x.ravel() for x in np.indices((other.kinds, other.kinds)))
     scales = band.scale(np.array([swing[k], speed[m], nesting[k]]))
-    expected = math.exp(float(np.mean(np.log(scales)) + np.mean(np.log(ratios))))
+    expected = math.exp(float(np.mean(np.log(scales)) + np.mean(np.log(band.ratios))))
     return Promise(percent(span * math.sqrt(mean), stroke), percent(span * expected, stroke))
 
 

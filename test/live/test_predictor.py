@@ -105,7 +105,7 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
 
 
 def test_the_band_of_a_stream_is_that_of_the_whole_voltage():
-    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), np.ones(5), 1e3)
     banded, v = model(identification={KEY: band.to_dict()}), drive(2000)
     predictor = Predictor(level=0.8)
     predictor.set_model(banded)
@@ -116,7 +116,7 @@ def test_the_band_of_a_stream_is_that_of_the_whole_voltage():
         halves.append(predictor.half_width.values)
     expected = BandStream(banded, 0.8, creep=False).follow(v, banded.simulate(v))
     np.testing.assert_array_equal(np.concatenate(halves), expected)
-    damaged = model(identification={KEY: {**band.to_dict(), 'ratio': None}})
+    damaged = model(identification={KEY: {**band.to_dict(), 'ratios': [None]}})
     with pytest.raises(ModelError, match=KEY):
         predictor.set_model(damaged)
     predictor.set_model(model())

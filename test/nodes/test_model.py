@@ -117,7 +117,7 @@ def test_without_a_model_it_waits_and_says_so(lab):
 
 
 def test_a_model_with_a_band_publishes_its_half_width_beside_the_prediction(fast):
-    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), np.ones(5), 1e3)
     text = paper(identification={KEY: band.to_dict()})
     halves = fast.collect('prediction_band')
     fast.matched('prediction_band')

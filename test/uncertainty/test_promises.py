@@ -53,7 +53,7 @@ def test_nothing_missing_promises_the_noise():
     result = diagnosis(0.0)
     other = result.model.score(record(0.0, seed=1)).percent
     assert 0.8 < other / result.promise.same < 1.25
-    assert set(result.model.identification[KEY]) == {'coefficients', 'kinds', 'ratio', 'speed'}
+    assert set(result.model.identification[KEY]) == {'coefficients', 'ratios', 'speed'}
 
 
 def test_promise_and_weights_are_in_the_json_and_the_page():

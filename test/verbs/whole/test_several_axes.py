@@ -183,7 +183,7 @@ def test_an_axis_that_was_measured_is_compared_alone():
 
 
 def test_a_band_is_made_for_the_axes_that_are_predicted():
-    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), 5, 1.0, 1e3)
+    band = PredictionBand(np.array([1e-3, 2e-3, 1e-5]), np.ones(5), 1e3)
     model = MultiAxisModel({axis: with_band(x, band) for axis, x in scanner().axes.items()})
     record = play(*raster(500))
     (half,) = bands(model, record, {'y_b': predict(model, record)['y_b']}, 0.9)['y_b']
