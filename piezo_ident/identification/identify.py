@@ -145,15 +145,8 @@ def _identify(
     known = fit.memories if data.labelled else None
     fast = fast_error(judged, fit.hysteresis.law, runs, known)
     provenance = _provenance(result, records, fast)
-    # samples count from where an unknown start is forgotten, as in `score`
     judged_runs = (
-        JudgedRun(
-            p.run.record,
-            p.run.piece,
-            p.y_hat,
-            p.judged if fit.fit is not None else p.judged & p.run.known,
-            ~fitted,
-        )
+        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)
         for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
     )
     result = replace(result, model=replace(model, identification=provenance))
