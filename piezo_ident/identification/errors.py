@@ -19,6 +19,7 @@ from piezo_ident.model.initial_memory import early_part, fit_start
 from piezo_ident.model.metrics import fit_percent, percent_of_stroke, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
+from piezo_ident.record.readings.faults import quantum_of
 from piezo_ident.record.readings.quiet_voltage import with_quiet_voltage
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
@@ -128,12 +129,20 @@ def errors_of(
 
 
 def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
-    """Estimate the noise floor from the residuals of all runs."""
+    """
+    Estimate the noise floor from the residuals of all runs.
+
+    A reading that rests on one step q of the converter hides its rounding, of q / sqrt(12).
+    """
     parts = [
         ResidualPart(p.run.record, p.run.piece, p.run.piece.y - p.y_hat, p.run.use)
         for p in predictions
     ]
-    return residual_noise_floor(parts, all_stretches(parts))
+    floor = residual_noise_floor(parts, all_stretches(parts))
+    rounding = max(quantum_of(p.run.piece.y) for p in predictions) / np.sqrt(12.0)
+    if floor.rms is None or floor.rms >= rounding:
+        return floor
+    return replace(floor, rms=float(rounding), source='the rounding of the converter')
 
 
 def with_fine_plays(model: StageModel, excerpts: Sequence[Excerpt]) -> StageModel:

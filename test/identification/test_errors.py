@@ -9,7 +9,12 @@ import numpy as np
 from paper_stage import PAPER as MODEL
 from paper_stage import STAGE
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.errors import fast_error, fitted_memories
+from piezo_ident.identification.errors import (
+    fast_error,
+    fitted_memories,
+    noise_floor_of,
+    predictions_of,
+)
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -73,3 +78,17 @@ def test_a_start_that_was_fitted_with_plays_is_estimated_again_for_another_law()
     assert off[0] < 0.1 * off[1]
     # runs that share a name and a time have no memory of their own
     assert not fitted_memories([run, run], MODEL, 'preisach')
+
+
+@pytest.mark.parametrize(('bits', 'rms'), [(8, 0.0), (16, 2e-3)])
+def test_noise_holds_the_rounding_of_a_coarse_converter(record, bits, rms):
+    (piece,) = record.pieces
+    stroke = float(np.ptp(piece.y))
+    step = stroke / 2**bits
+    noise = rms * stroke * np.random.default_rng(1).standard_normal(piece.n)
+    y = step * np.rint((MODEL.predict_piece(piece) + noise) / step)
+    coarse = replace(record, pieces=(replace(piece, y=y),))
+    predictions = predictions_of(MODEL, runs_of([coarse], MODEL.sample_rate, MODEL.scaling))
+    floor = noise_floor_of(predictions)
+    assert floor.rms == pytest.approx(max(step / np.sqrt(12.0), rms * stroke), rel=0.1)
+    assert ('rounding' in floor.source) == (bits == 8)
