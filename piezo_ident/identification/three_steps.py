@@ -85,7 +85,7 @@ def fit_three_steps(
     kinds = ('triangle', 'noise', 'settle', 'step')
     masks = [(run.mask(*kinds) & ~(out := run.held_out()), out) for run in runs]
     results = model, delay_result, best.dynamics, best.hysteresis
-    memories = fitted_memories(runs, model, best.hysteresis.law)
+    memories = fitted_memories(runs, model)
     return FitOutcome(*results, masks, warnings, tuple(missing.items()), memories)
 
 

@@ -63,7 +63,7 @@ def test_all_fast_motion_is_that_of_the_displacement(record):
     assert fast == pytest.approx(100.0 * rms / np.ptp(piece.y), rel=0.1)
 
 
-def test_a_start_that_was_fitted_with_plays_is_estimated_again_for_another_law():
+def test_a_start_that_the_steps_fitted_is_estimated_again():
     v = 5.0 + 5.0 * np.sin(2.0 * np.pi * np.arange(6000) / 2000.0)
     r = MODEL.hysteresis.thresholds
     piece = Piece(v, v, MODEL.sample_rate)
@@ -71,13 +71,12 @@ def test_a_start_that_was_fitted_with_plays_is_estimated_again_for_another_law()
     record = Record((replace(piece, y=y),), 'record')
     (run,) = runs_of([record], MODEL.sample_rate, MODEL.scaling)
     run = replace(run, memory=lambda thresholds: 0.5 - thresholds)
-    [of_plays] = fitted_memories([run], MODEL, 'plays').values()
-    np.testing.assert_array_equal(of_plays, 0.5 - r)
-    [again] = fitted_memories([run], MODEL, 'preisach').values()
-    off = [np.abs(MODEL.predict_piece(piece, start) - y).max() for start in (again, of_plays)]
+    [again] = fitted_memories([run], MODEL).values()
+    of_steps = run.start(r)
+    off = [np.abs(MODEL.predict_piece(piece, start) - y).max() for start in (again, of_steps)]
     assert off[0] < 0.1 * off[1]
     # runs that share a name and a time have no memory of their own
-    assert not fitted_memories([run, run], MODEL, 'preisach')
+    assert not fitted_memories([run, run], MODEL)
 
 
 @pytest.mark.parametrize(('bits', 'rms'), [(8, 0.0), (16, 2e-3)])
