@@ -28,14 +28,9 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError, DataError, naming
 from piezo_ident.common.files import write_text
 from piezo_ident.model.axes_file import load
+from piezo_ident.model.axis_records import is_measured, voltage_of
 from piezo_ident.model.free_run import FreeRun
-from piezo_ident.model.multi_axis import (
-    each_of,
-    is_measured,
-    models_of,
-    MultiAxisModel,
-    voltage_of,
-)
+from piezo_ident.model.multi_axis import each_of, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.io import write_columns

@@ -42,8 +42,9 @@ from piezo_ident.fitting.modes.periods import (
 )
 from piezo_ident.fitting.modes.signals import with_input_plays, with_loop_plays, with_softening
 from piezo_ident.identification.settings import Progress
+from piezo_ident.model.axis_records import axes_of, voltage_of
 from piezo_ident.model.modes.shared_modes import SharedModes
-from piezo_ident.model.multi_axis import axes_of, MultiAxisModel, voltage_of
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.record.channels import Axes
 from piezo_ident.record.record import Record
 

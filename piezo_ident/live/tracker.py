@@ -26,7 +26,8 @@ from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.history import History
 from piezo_ident.live.predictor import check_axes
-from piezo_ident.model.multi_axis import alone, models_of, MOTION, motion_of, MultiAxisModel
+from piezo_ident.model.axis_records import MOTION, motion_of
+from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
 from piezo_ident.record.blocks import Samples
@@ -237,6 +238,8 @@ def prepared(
         When the model has other axes.
     """
     check_axes(model, axes)
+    if isinstance(model, MultiAxisModel):
+        model.require_chains('feedforward')
     if not axes[1:]:
         (model,) = models_of(model).values()
         if now is not None and (now.settings, now.follow) == (settings, follow):

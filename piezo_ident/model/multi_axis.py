@@ -8,12 +8,7 @@ A stage of several axes: a chain for each axis, and paths between them.
 
 m_j is the motion of axis j by its own voltage.  A path therefore carries the hysteresis, the modes
 and the creep of its source.  A path is the effect `cross_coupling` in the model of axis i; its
-channel is the motion.  An axis has the name of its displacement in a record:
-
-| axis | voltage | displacement | its motion, as a channel of the others |
-|---|---|---|---|
-| first | ``v`` | ``y`` | ``motion`` |
-| ``b`` | ``v_b`` | ``y_b`` | ``motion_b`` |
+channel is the motion.  `piezo_ident.model.axis_records` has the names of the axes.
 
 Hysteresis inside the loop of modes that the axes share is no sum of chains.  A model with such
 `modes` (`piezo_ident.model.modes.shared_modes`) predicts all displacements by them.
@@ -21,7 +16,7 @@ Hysteresis inside the loop of modes that the axes share is no sum of chains.  A 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 import os
 from types import MappingProxyType
@@ -29,116 +24,19 @@ from typing import Any, Generic, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, interpolated
+from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
+from piezo_ident.model.axis_records import axis_record, columns_of, MOTION, motion_of, voltage_of
 from piezo_ident.model.free_run import free_run, predict
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 T = TypeVar('T')
-
-MOTION = 'motion'
-
-
-def voltage_of(axis: str) -> str:
-    """
-    Name the column of the voltage of an axis.
-
-    >>> voltage_of('y'), voltage_of('y_b')
-    ('v', 'v_b')
-    """
-    return f'v{axis[1:]}'
-
-
-def motion_of(axis: str) -> str:
-    """Name the channel with the motion of an axis by its own voltage."""
-    return f'{MOTION}{axis[1:]}'
-
-
-def axes_of(records: Sequence[Record]) -> tuple[str, ...]:
-    """
-    List the axes whose voltage and displacement the records hold; the first axis is ``y``.
-
-    Raises
-    ------
-    DataError
-        When the records do not hold the same axes.
-    """
-    of_each = [
-        (
-            record.name,
-            'y',
-            *sorted(k for k in p.channels if role_of(k) == 'y' and voltage_of(k) in p.channels),
-        )
-        for record in records
-        for p in record
-    ]
-    if len({axes[1:] for axes in of_each}) > 1:
-        told = '; '.join(f'{name} holds {", ".join(axes)}' for name, *axes in of_each)
-        raise DataError(f'{told}; give records of the same axes')
-    return next(iter(of_each), ('', 'y'))[1:]
-
-
-def is_measured(record: Record, axis: str) -> bool:
-    """Tell whether a record holds the displacement of an axis."""
-    return all(np.isfinite(_columns(p).get(axis, np.nan)).any() for p in record)
-
-
-def axis_record(
-    record: Record, axis: str, motions: Mapping[str, Sequence[Array]] | None = None
-) -> Record:
-    """
-    Reduce a record to one axis.
-
-    Parameters
-    ----------
-    record : Record
-    axis : str
-        The voltage and displacement of this axis become v and y.  A segment in which the axis
-        rests loses its label.
-    motions : mapping of str to sequence of ndarray, optional
-        Motions by axis, an array for each piece [m].  Those of the other axes become channels.
-    """
-    span = max(float(np.ptp(_columns(p)[voltage_of(axis)])) for p in record)
-
-    def seen(piece: Piece, moved: Mapping[str, Array]) -> Piece:
-        columns = _columns(piece)
-        v, sound = columns[voltage_of(axis)], piece.sound
-        y = columns.get(axis, np.full(piece.n, np.nan))
-        if axis != 'y':
-            known = np.isfinite(y)
-            sound = None if known.all() or not known.any() else known
-            y = y if sound is None else interpolated(y, ~known)
-        kept = (s for s in piece.segments if np.ptp(v[s.start : s.stop]) > 1e-3 * span)
-        before = piece.before and seen(
-            piece.before, {k: np.full(piece.before.n, m[0]) for k, m in moved.items()}
-        )
-        others = {k: x for k, x in piece.channels.items() if not role_of(k)}
-        return replace(
-            piece,
-            v=v,
-            y=y,
-            sound=sound,
-            segments=tuple(kept),
-            before=before,
-            channels={**others, **{motion_of(k): m for k, m in moved.items()}},
-        )
-
-    pieces = tuple(
-        seen(piece, {k: m[i] for k, m in (motions or {}).items() if k != axis})
-        for i, piece in enumerate(record)
-    )
-    return Record(pieces, record.name, record.faults)
-
-
-def _columns(piece: Piece) -> dict[str, Array]:
-    return {**piece.channels, 'v': piece.v, 'y': piece.y}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -323,7 +221,7 @@ class MultiAxisModel:
 
     def seen(self, record: Record) -> dict[str, Record]:
         """Split a record by axis, with the motions of the other axes as channels."""
-        self.check_axes({c for piece in record for c in _columns(piece)}, record.name)
+        self.check_axes({c for piece in record for c in columns_of(piece)}, record.name)
         motions = None if self.modes is not None else self.motions(record)
         return {axis: axis_record(record, axis, motions) for axis in self.axes}
 
@@ -400,8 +298,16 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 
 
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
-    """List the model of each axis without the paths of the others."""
-    return {'y': model} if isinstance(model, StageModel) else {a: model.own(a) for a in model.axes}
+    """
+    List the model of each axis without the paths of the others.
+
+    Effects of chains are no part of a prediction by shared modes, and are left out.
+    """
+    if isinstance(model, StageModel):
+        return {'y': model}
+    if model.modes is not None:
+        return {a: replace(x, effects=()) for a, x in model.axes.items()}
+    return {a: model.own(a) for a in model.axes}
 
 
 def with_own(

@@ -11,7 +11,8 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.export.header import export_c as export_axis
 from piezo_ident.export.header import plain_text
 from piezo_ident.export.links import LinkGroup, links_of
-from piezo_ident.model.multi_axis import MOTION, motion_of, MultiAxisModel, voltage_of
+from piezo_ident.model.axis_records import MOTION, motion_of, voltage_of
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
 

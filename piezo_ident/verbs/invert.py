@@ -16,13 +16,9 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.control.inverse import Inverse
 from piezo_ident.control.inverse import invert as invert_axis
 from piezo_ident.control.learning import Learning
+from piezo_ident.model.axis_records import motion_of, voltage_of
 from piezo_ident.model.metrics import percent_of_stroke
-from piezo_ident.model.multi_axis import (
-    EachAxis,
-    motion_of,
-    MultiAxisModel,
-    voltage_of,
-)
+from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
 #: most rounds of an inversion of several axes, and the change of a voltage between two rounds that

@@ -20,13 +20,8 @@ from piezo_ident.diagnosis.shared_modes import NAME as LOOP
 from piezo_ident.identification.identify import identify_and_judge
 from piezo_ident.identification.results import Identification, Steps
 from piezo_ident.identification.settings import Progress, Settings, silent
-from piezo_ident.model.multi_axis import (
-    axes_of,
-    axis_record,
-    EachAxis,
-    MultiAxisModel,
-    voltage_of,
-)
+from piezo_ident.model.axis_records import axes_of, axis_record, voltage_of
+from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of

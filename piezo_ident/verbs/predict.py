@@ -10,17 +10,12 @@ from typing import overload
 
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, expect
+from piezo_ident.model.axis_records import axis_record, is_measured
 from piezo_ident.model.free_run import compared, FreeRun
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import predict as predict_axis
 from piezo_ident.model.initial_memory import unknown_starts
-from piezo_ident.model.multi_axis import (
-    axis_record,
-    EachAxis,
-    is_measured,
-    models_of,
-    MultiAxisModel,
-)
+from piezo_ident.model.multi_axis import EachAxis, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record

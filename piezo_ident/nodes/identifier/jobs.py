@@ -32,15 +32,9 @@ from piezo_ident.live.capture import (
     Snapshot,
 )
 from piezo_ident.model.axes_file import text_of
+from piezo_ident.model.axis_records import voltage_of
 from piezo_ident.model.free_run import piece_runs, PieceRun
-from piezo_ident.model.multi_axis import (
-    each_of,
-    EachAxis,
-    mapped,
-    models_of,
-    MultiAxisModel,
-    voltage_of,
-)
+from piezo_ident.model.multi_axis import each_of, EachAxis, mapped, models_of, MultiAxisModel
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record

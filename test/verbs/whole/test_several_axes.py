@@ -11,7 +11,8 @@ from c_compiler import COMPILER, needs_compiler, STRICT
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.identification.results import Steps
-from piezo_ident.model.multi_axis import axis_record, MultiAxisModel
+from piezo_ident.model.axis_records import axis_record
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.uncertainty.band import PredictionBand
 from piezo_ident.uncertainty.promises import with_band
 from piezo_ident.verbs.predict import bands, predict
