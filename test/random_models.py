@@ -7,10 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 from paper_stage import FS, PAPER
+from piezo_ident.model.modes.modal import balanced, Modal
+from piezo_ident.model.modes.shared_modes import SharedModes
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from scipy.ndimage import gaussian_filter1d
 
 
 def random_hysteresis(rng: np.random.Generator, law: str) -> Hysteresis:
@@ -108,3 +112,58 @@ def smooth_motion(rng: np.random.Generator, model: StageModel, n: int = 3000) ->
     soft = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.05) ** 2
     x = 0.5 * (low + high) + 0.5 * (high - low) * soft * waves
     return np.asarray(model.scaling.y(x))
+
+
+def random_shared_modes(
+    rng: np.random.Generator, axes: int = 2, softens: bool = True, strength: float = 0.1
+) -> SharedModes:
+    """Return coupled modes with plays in front and inside their loop, softening or not."""
+    order = 2 * int(rng.integers(axes, axes + 3))
+    w, damping = rng.uniform(0.2, 1.2, order // 2), rng.uniform(0.01, 0.1, order // 2)
+    poles = np.exp(w * (1j - damping))
+    blocks = np.array([[[p.real, p.imag], [-p.imag, p.real]] for p in poles])
+    shape = rng.normal(0.0, 0.3, (axes, order // 2)) + 2.0 * np.eye(axes, order // 2)
+    free = Modal(blocks, np.zeros((order, axes)), np.zeros((axes, order)), np.zeros((axes, axes)))
+    static = np.linalg.inv(np.eye(order) - free.a)
+    b, c = free.b.copy(), free.c.copy()
+    for i in range(order // 2):
+        b[2 * i + 1], c[:, 2 * i] = shape[:, i], shape[:, i]
+        # each mode has its gain at rest
+        b[2 * i + 1] *= 1e-6 * rng.uniform(0.3, 1.0) / static[2 * i, 2 * i + 1]
+    linear = balanced(replace(free, b=b, c=c))
+    gain = np.linalg.inv(linear.response(np.ones(1, complex))[0].real)
+    f, levels = gain @ linear.c, axes if softens else 0
+    nothing = np.zeros((axes, order))
+    signals = [f, f, nothing] if softens else [f, nothing]
+    plays = np.array([[0.0] * 3] * levels + [[0.3, 0.3, 0.4]] * 2 * axes)
+    e = np.hstack([rng.uniform(0.2, 1.0) * strength * linear.b for _ in signals])
+    modes = SharedModes(
+        linear,
+        e=e,
+        h=np.zeros((axes, e.shape[1])),
+        f=np.vstack(signals) / 2.0,
+        g=np.vstack([np.zeros((e.shape[1] - axes, axes)), np.eye(axes)]) / 2.0,
+        levels=levels,
+        mu=plays,
+        r=np.array([0.1, 0.4, 0.9]),
+        memory=float(rng.uniform(30.0, 300.0)),
+        range=(0.5, 1.6),
+        v0=rng.uniform(3.0, 6.0, axes),
+        y0=rng.uniform(0.0, 1e-5, axes),
+    )
+    return modes if modes.radius < 0.999 else random_shared_modes(rng, axes, softens, strength)
+
+
+def random_modes_model(rng: np.random.Generator, axes: int = 2, **options) -> MultiAxisModel:
+    """Return a model of several axes that predicts by shared modes."""
+    modes = random_shared_modes(rng, axes, **options)
+    names = ['y', 'y_b', 'y_c', 'y_d'][:axes]
+    scaling = replace(PAPER.scaling, range=(0.0, 10.0))
+    return MultiAxisModel({a: replace(PAPER, scaling=scaling) for a in names}, modes)
+
+
+def random_voltages(rng: np.random.Generator, modes: SharedModes, n: int, size: float = 3.0):
+    """Return smooth voltages about those of the fit, shape (n, axes)."""
+    steps = rng.normal(size=(n, len(modes.v0)))
+    smooth = gaussian_filter1d(steps, rng.uniform(3.0, 30.0), axis=0)
+    return modes.v0 + size * smooth / np.abs(smooth).max()

@@ -4,7 +4,7 @@
 """
 Predict the displacement of a running stage, through gaps, restarts and new models.
 
-`AxesRun` runs a model; `Predictor` meets what a stream may bring.
+`AxesRun` runs chains and `ModesRun` shared modes; `Predictor` meets what a stream may bring.
 `piezo_ident.live.history` brings a new model into the state that it would have if it had run from
 the start.
 """
@@ -18,7 +18,9 @@ from piezo_ident.common.arrays import Array, line_between
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import BlockClock, Kind
-from piezo_ident.model.multi_axis import alone, models_of, MOTION, motion_of, MultiAxisModel
+from piezo_ident.model.axis_records import MOTION, motion_of
+from piezo_ident.model.modes.stream import ModesRun
+from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel
 from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -98,10 +100,15 @@ class AxesRun:
         return y
 
 
+def run_of(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> AxesRun | ModesRun:
+    """Begin a run of a model, with the axes in this order."""
+    if isinstance(model, MultiAxisModel) and model.modes is not None:
+        return ModesRun(model.modes, axes)
+    return AxesRun(model, axes)
+
+
 def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
     """Refuse a model of other axes than those of a node with a ModelError."""
-    if isinstance(model, MultiAxisModel):
-        model.require_chains('live')
     held = models_of(model)
     if set(held) != set(axes):
         raise ModelError(
@@ -154,7 +161,7 @@ class Predictor:
 
     def _clear(self) -> None:
         self._pasts = [History() for _ in self._axes]
-        self._run: AxesRun | None = None
+        self._run: AxesRun | ModesRun | None = None
         self._bands = list[BandStream]()
         self._lowest = [float('inf')] * len(self._axes)
 
@@ -178,10 +185,14 @@ class Predictor:
         """
         Whether the memory of the plays is known.
 
-        The lower end of the voltage range makes it known, until the next gap or new run.
+        The lower end of the voltage range makes it known, until the next gap or new run.  So does
+        a sweep of all plays of shared modes.
         """
+        run = self._run
         if self.model is None:
             return False
+        if isinstance(run, ModesRun) and (run.is_partial or run.stream.is_swept):
+            return run.stream.is_swept
         each = models_of(self.model)
         return all(
             each[a].scaling.u(v) < REST for a, v in zip(self._axes, self._lowest, strict=True)
@@ -210,11 +221,11 @@ class Predictor:
         for one in _with_band(model):
             # a damaged band is refused now, not in the stream
             band_of(one)
-        self.model = model
-        self._run, self._bands = None, []
+        run = None
         if self._pasts[0]:
-            self._run = AxesRun(model, self._axes)
-            self._run.recall(self._pasts, self._clock.period)
+            run = run_of(model, self._axes)
+            run.recall(self._pasts, self._clock.period)
+        self.model, self._run, self._bands = model, run, []
         if self._pasts[0] and self.problem.startswith('the stream'):
             self.problem = ''
 
@@ -318,6 +329,8 @@ class Predictor:
         between = np.stack([line_between(*end, missing) for end in ends])
         self._advance(line_between(t0, t1, missing), between)
         self._lowest = [float('inf')] * len(self._axes)
+        if isinstance(self._run, ModesRun):
+            self._run.stream.forget()
 
     def _advance(self, t: Array, v: Array) -> Array | None:
         self._remember(t, v)
@@ -330,8 +343,12 @@ class Predictor:
             except ModelError as error:
                 self.problem = str(error)
                 return None
-            self._run = AxesRun(model, self._axes)
-        y = self._run.process(v, t)
+            self._run = run_of(model, self._axes)
+        try:
+            y = self._run.process(v, t)
+        except ModelError as error:
+            self.problem, self._run = f'{error}; the prediction begins anew', None
+            return None
         self.felt = self._run.felt
         return y
 

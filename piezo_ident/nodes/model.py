@@ -19,8 +19,8 @@ from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.join import Join
 from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
-from piezo_ident.live.predictor import AxesRun, Predictor, warm_up
-from piezo_ident.model.multi_axis import alone, models_of, with_own
+from piezo_ident.live.predictor import Predictor, run_of, warm_up
+from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel, with_own
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
 from piezo_ident.nodes.parameter_node import home_problem
@@ -95,10 +95,16 @@ class ModelNode(LabNode):
         on_message = functools.partial(self._on_block, what, tail)
         return self.create_subscription(Float64MultiArray, f'{what}{tail}', on_message, STREAM)
 
+    def _check_adaptation(self, adapt: str, model: Model | None) -> None:
+        if isinstance(model, MultiAxisModel) and adapt != 'off':
+            model.require_chains('adapt')
+
     # models
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a missing model file; ``~/status`` reports faults inside a file."""
+        if name == 'adapt' and hasattr(self, '_predictor'):
+            self._check_adaptation(value, self._predictor.model)
         return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -121,6 +127,7 @@ class ModelNode(LabNode):
     def _take_model(self, model: Model | None, source: str) -> None:
         try:
             if model is not None:
+                self._check_adaptation(self.values['adapt'], model)
                 self._predictor.set_model(model)
                 for k, (tail, one) in enumerate(self._comparisons.items()):
                     one.set_model(alone(model)[f'y{tail}'], self._recalled(k))
@@ -339,5 +346,5 @@ def _tried(model: Model) -> Model:
     """Run a few samples, which compiles the kernels of a model and finds its faults."""
     axes = models_of(model)
     rest = np.array([[x.scaling.range[0]] * 10 for x in axes.values()])
-    AxesRun(model, [*axes]).process(rest, np.arange(10) / model.sample_rate)
+    run_of(model, [*axes]).process(rest, np.arange(10) / model.sample_rate)
     return model

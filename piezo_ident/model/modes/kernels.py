@@ -50,6 +50,19 @@ class Loop(NamedTuple):
     kappa: float
 
 
+class LoopState(NamedTuple):
+    """State between two runs: x, outputs of the plays, and the squared level, shape (1,)."""
+
+    x: Array
+    memory: Array
+    level: Array
+
+    @classmethod
+    def at_zero(cls, loop: Loop) -> LoopState:
+        """Make the state of a stage that never moved; its level is that of the fit."""
+        return cls(np.zeros(len(loop.b)), np.zeros(loop.mu.shape), np.ones(1))
+
+
 class Passage(NamedTuple):
     """States, signals, pushes, plays, gates, squared level and outputs, one row a sample."""
 
@@ -63,9 +76,9 @@ class Passage(NamedTuple):
 
 
 @kernel
-def trajectory(u: Array, loop: Loop, run: Passage) -> int:
+def trajectory(u: Array, loop: Loop, state: LoopState, run: Passage) -> int:
     """
-    Run the loop over u from rest, and write what passes into `run`.
+    Run the loop over u, move `state` on, and write the signals into `run`.
 
     The result is the number of samples that were run: fewer than u if the stage runs away.
     """
@@ -75,7 +88,7 @@ def trajectory(u: Array, loop: Loop, run: Passage) -> int:
     samples, inputs = u.shape
     order, signals = e.shape
     thresholds = len(r)
-    x, memory, level = np.zeros(order), np.zeros(mu.shape), 1.0
+    x, memory, level = state.x, state.memory, state.level[0]
     p = np.zeros(signals)
     new = np.zeros(order)
     for t in range(samples):
@@ -134,6 +147,7 @@ def trajectory(u: Array, loop: Loop, run: Passage) -> int:
             x[i] = alive(value)
             if not abs(value) < 1e12:
                 return t
+    state.level[0] = level
     return int(samples)
 
 

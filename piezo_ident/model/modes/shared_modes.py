@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.model.modes.kernels import Loop, Passage, trajectory
+from piezo_ident.model.modes.kernels import Loop, LoopState, Passage, trajectory
 from piezo_ident.model.modes.modal import Modal
 
 #: share of the slowest mode that is left when a run begins at rest (taste)
@@ -136,11 +136,9 @@ class SharedModes:
         ModelError
             When the displacements grow without bound.
         """
-        u = np.asarray(v, dtype=np.float64) - self.v0
-        if not len(u):
-            return np.zeros((0, len(self.y0)))
-        settled = np.vstack([np.repeat(u[:1], self.settling, axis=0), u])
-        return self.run(settled).y[self.settling :] + self.y0
+        from piezo_ident.model.modes.stream import ModesStream
+
+        return ModesStream(self).process(np.asarray(v, dtype=np.float64))
 
     def of_axes(self, v: Mapping[str, ArrayLike]) -> dict[str, Array]:
         """Simulate the axes in alphabetical order; voltages [V], displacements [m] by axis."""
@@ -163,8 +161,12 @@ class SharedModes:
         y = self.run(np.concatenate([u, u])).y[len(u) :]
         return np.asarray(y - y.mean(axis=0))
 
-    def run(self, u: Array) -> Passage:
-        """Run the equations under voltages u about `v0`, all states at zero before."""
+    def run(self, u: Array, state: LoopState | None = None) -> Passage:
+        """
+        Run the equations under voltages u about `v0`, and move `state` on.
+
+        All states are zero before, if none is given.
+        """
         u = np.ascontiguousarray(u, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != self.linear.b.shape[1]:
             raise DataError(
@@ -181,7 +183,8 @@ class SharedModes:
             np.zeros(n),
             np.zeros((n, len(self.h))),
         )
-        done = trajectory(u, self.loop, run)
+        loop = self.loop
+        done = trajectory(u, loop, LoopState.at_zero(loop) if state is None else state, run)
         if done < n:
             raise ModelError(f'the shared modes run away at sample {done} of {n}')
         return run

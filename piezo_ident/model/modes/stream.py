@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Run modes that several axes share, block by block: volts in, metres out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import DataError
+from piezo_ident.model.modes.kernels import LoopState
+from piezo_ident.model.modes.shared_modes import SharedModes
+
+#: number of samples that run at once; the signals then stay in the cache
+CHUNK = 8192
+
+
+class ModesStream:
+    """
+    Run of shared modes.  The stage is at rest under the first sample.
+
+    Parameters
+    ----------
+    modes : SharedModes
+    """
+
+    def __init__(self, modes: SharedModes) -> None:
+        self.modes = modes
+        self._state: LoopState | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Take the outputs of the plays as unknown from now on."""
+        self._low, self._high = np.full((2, self.modes.signals), [[np.inf], [-np.inf]])
+
+    @property
+    def is_swept(self) -> bool:
+        """
+        Whether the motion so far determines the plays.
+
+        A sweep of a signal over twice the largest threshold of its plays determines them.
+        """
+        held = self.modes.mu != 0
+        widest = np.max(held * self.modes.r, axis=1, initial=0.0)
+        return bool((self._high - self._low >= 2 * widest)[held.any(axis=1)].all())
+
+    def process(self, v: Array) -> Array:
+        """Compute the next displacements [m] of voltages [V], shapes (n, outputs), (n, inputs)."""
+        modes = self.modes
+        if v.ndim != 2 or v.shape[1] != len(modes.v0):
+            raise DataError(
+                f'voltages of shape {v.shape} do not fit {len(modes.v0)} inputs; '
+                'give (samples, inputs)'
+            )
+        u, y = v - modes.v0, np.empty((len(v), len(modes.y0)))
+        if self._state is None and len(u):
+            self._state = LoopState.at_zero(modes.loop)
+            modes.run(np.repeat(u[:1], modes.settling, axis=0), self._state)
+        for start in range(0, len(u), CHUNK):
+            run = modes.run(u[start : start + CHUNK], self._state)
+            y[start : start + CHUNK] = run.y + modes.y0
+            self._low = np.minimum(self._low, run.z.min(axis=0))
+            self._high = np.maximum(self._high, run.z.max(axis=0))
+        return y
+
+
+class Past(Protocol):
+    """Voltage of an axis so far, in `count` samples."""
+
+    count: int
+
+    def since(self, count: int) -> Array:
+        """Return the voltage after the first `count` samples [V], as far as it is kept."""
+
+
+class ModesRun:
+    """
+    Run of shared modes with a row of voltages and of displacements for each axis.
+
+    Parameters
+    ----------
+    modes : SharedModes
+    axes : sequence of str
+        Order of the rows, by the names of the displacements.
+
+    Attributes
+    ----------
+    stream : ModesStream
+    is_partial : bool
+        Whether the run lacks older voltages, on which its plays may depend.
+    felt : ndarray, shape (k, n)
+        Zero: no part of a displacement is that of another axis alone.
+    """
+
+    def __init__(self, modes: SharedModes, axes: Sequence[str]) -> None:
+        self.stream = ModesStream(modes)
+        self._order = np.argsort(axes)
+        self._rows = np.argsort(self._order)
+        self.is_partial = False
+        self.felt = np.zeros((len(axes), 0))
+
+    def recall(self, pasts: Sequence[Past], period: float) -> None:
+        """Run through the voltages that `pasts` still keep, one past a row."""
+        v = np.stack([past.since(0) for past in pasts])
+        self.is_partial = v.shape[1] < pasts[0].count
+        self.process(v)
+
+    def process(self, v: Array, t: Array | None = None) -> Array:
+        """Compute the next displacements [m] of voltages [V], shapes (k, n); t is not used."""
+        self.felt = np.zeros(v.shape)
+        return np.ascontiguousarray(self.stream.process(v[self._order].T).T[self._rows])

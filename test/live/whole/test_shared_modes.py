@@ -1,0 +1,114 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Modes that axes share, live: predicted block by block as offline, to the last bit."""
+
+from dataclasses import replace
+
+import numpy as np
+import piezo_ident as pi
+from piezo_ident.live.predictor import Predictor
+from piezo_ident.model.modes.stream import ModesStream
+from piezo_ident.record.blocks import Samples
+import pytest
+from random_models import random_modes_model, random_voltages
+
+RATE = 20e3
+AXES = ('y', 'y_b', 'y_c')
+
+
+def case(seed, axes=2, n=3000, **options):
+    """Return a model and voltages, a row for each axis."""
+    rng = np.random.default_rng(seed)
+    model = random_modes_model(rng, axes, **options)
+    return model, np.ascontiguousarray(random_voltages(rng, model.modes, n).T)
+
+
+def offline(model, v, axes):
+    """Return the prediction of `simulate`, a row for each axis."""
+    columns = {f'v{axis[1:]}': row for axis, row in zip(axes, v, strict=True)}
+    y = model.simulate(columns)
+    return np.stack([y[axis] for axis in axes])
+
+
+def predicted(predictor, v, start=0, size=70):
+    t = (start + np.arange(v.shape[1])) / RATE
+    blocks = [
+        predictor.process(Samples(t[k : k + size], v[:, k : k + size]))
+        for k in range(0, t.size, size)
+    ]
+    return np.hstack([block.values for block in blocks])
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_the_live_prediction_is_the_offline_one_to_the_last_bit(seed):
+    axes = 1 + seed % 3
+    model, v = case(seed, axes, softens=bool(seed % 2))
+    order = AXES[:axes][::-1]
+    expected = offline(model, v, order)
+    assert np.ptp(expected, axis=1).min() > 1e-8
+    for size in (1 + seed * 17, 500):
+        predictor = Predictor(order)
+        predictor.set_model(model)
+        np.testing.assert_array_equal(predicted(predictor, v, size=max(size, 2)), expected)
+    stream, cut = ModesStream(model.modes), np.random.default_rng(seed).integers(1, 2999, 40)
+    columns = v[::-1].T
+    parts = [stream.process(x) for x in np.split(columns, np.sort(cut))]
+    np.testing.assert_array_equal(np.vstack(parts).T[::-1], expected)
+
+
+def test_a_model_that_comes_late_has_the_state_of_one_that_came_first():
+    model, v = case(7)
+    predictor = Predictor(AXES[:2])
+    t = np.arange(2000) / RATE
+    assert predictor.process(Samples(t, v[:, :2000])) is None
+    predictor.set_model(model)
+    late = predicted(predictor, v[:, 2000:], start=2000)
+    np.testing.assert_array_equal(late, offline(model, v, AXES[:2])[:, 2000:])
+
+
+def test_a_late_model_knows_its_memory_after_a_sweep(monkeypatch):
+    # the voltages in full are too short for the plays
+    monkeypatch.setattr('piezo_ident.live.history.RECENT', 0.01)
+    model, v = case(8, n=6000)
+    v[:, :3000] = v[:, [0]]
+    predictor = Predictor(AXES[:2])
+    for k in range(0, 3000, 100):
+        predictor.process(Samples((k + np.arange(100)) / RATE, v[:, k : k + 100]))
+    predictor.set_model(model)
+    assert not predictor.memory_known
+    late = predicted(predictor, v[:, 3000:], start=3000)
+    assert predictor.memory_known
+    # once the plays are swept, the earlier motion is forgotten
+    error = late - offline(model, v, AXES[:2])[:, 3000:]
+    assert np.abs(error[:, -500:]).max() < 1e-9 * np.ptp(late)
+
+
+def test_a_gap_is_bridged_and_the_memory_is_unknown_until_the_next_sweep():
+    model, v = case(9, n=4000)
+    v[:, 2001:2050] = v[:, [2000]] + np.arange(1, 50) / 50 * (v[:, [2050]] - v[:, [2000]])
+    predictor = Predictor(AXES[:2])
+    predictor.set_model(model)
+    made = [predicted(predictor, v[:, :2001])]
+    assert predictor.memory_known
+    made.append(predicted(predictor, v[:, 2050:2060], start=2050))
+    assert not predictor.memory_known
+    made.append(predicted(predictor, v[:, 2060:], start=2060))
+    assert predictor.lost == 49 and predictor.memory_known
+    whole = np.delete(offline(model, v, AXES[:2]), np.s_[2001:2050], axis=1)
+    np.testing.assert_allclose(np.hstack(made), whole, rtol=0.0, atol=1e-12 * np.ptp(whole))
+
+
+def test_modes_that_run_away_are_a_problem_of_the_stream():
+    model, v = case(10)
+    wild = replace(model.modes, e=-300.0 * model.modes.e, levels=0)
+    predictor = Predictor(AXES[:2])
+    predictor.set_model(pi.MultiAxisModel(model.axes, wild))
+    answers = [predictor.process(Samples((k + np.arange(100)) / RATE, v[:, k : k + 100]))
+               for k in range(0, 3000, 100)]  # fmt: skip
+    assert None in answers and 'run away' in predictor.problem
+
+
+def test_shared_modes_of_other_axes_are_refused():
+    with pytest.raises(pi.ModelError, match="'axes'"):
+        Predictor(('y', 'y_c')).set_model(case(11)[0])
