@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
+from piezo_ident.control.inputs import checked_motion
 from piezo_ident.control.inverse import Inverse
 from piezo_ident.control.inverse import invert as invert_axis
 from piezo_ident.control.learning import Learning
+from piezo_ident.control.modes_inverse import invert_modes
 from piezo_ident.model.axis_records import motion_of, voltage_of
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
@@ -42,7 +44,8 @@ class MultiAxisInverse(EachAxis[Inverse]):
     lead : int
         Samples by which the voltages begin before the wanted motion.
     remaining : dict of str to float
-        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead.
+        100 rms(wanted - predicted) / (max wanted - min wanted), without the lead.  For an axis at
+        rest the span of the model replaces the denominator.
 
     Examples
     --------
@@ -96,10 +99,11 @@ def invert(
     model : StageModel or MultiAxisModel
     wanted : array_like, shape (n,), or mapping of str to array_like
         Displacement [m], sampled at the rate of the model.  A model of several axes needs a
-        mapping by axis; an absent axis rests at the displacement of its lowest voltage.  The stage
-        is taken to rest before and after the motion.  The rest before it is the state after one
-        stroke from the lowest voltage, settled.  With creep, begin at the displacement of the
-        lowest voltage, which does not creep.
+        mapping by axis; an absent axis rests at the displacement of its lowest voltage, with
+        shared modes at that of the middle voltage of their fit.  The stage is taken to rest before
+        and after the motion.  The rest before it is the state after one stroke from the lowest
+        voltage, settled.  With creep, begin at the displacement of the lowest voltage, which does
+        not creep.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     **options
@@ -137,8 +141,9 @@ def invert(
         if isinstance(wanted, Mapping):
             raise DataError('invert: the model has one axis; give one motion')
         return invert_axis(model, wanted, channels=channels, **options)
-    model.require_chains('invert')
     goals = _goals(model, wanted)
+    if model.modes is not None:
+        return _driven(model, invert_modes(model, model.modes, goals, **options), channels)
     moved, found = dict(goals), dict[str, Inverse]()
     for _ in range(ROUNDS):
         last, found = found, {}
@@ -151,12 +156,24 @@ def invert(
             moved[axis] = y[one.lead :]
         if last and all(_alike(last[k], found[k], model.axes[k].scaling.V) for k in found):
             break
+    return _driven(model, found, channels)
+
+
+def _driven(
+    model: MultiAxisModel,
+    found: Mapping[str, Inverse],
+    channels: Mapping[str, ArrayLike] | None,
+) -> MultiAxisInverse:
+    """Run the whole model under the voltages of the axes, from one common beginning."""
     lead = max(one.lead for one in found.values())
     v = {
         voltage_of(k): np.pad(one.v, (lead - one.lead, 0), mode='edge') for k, one in found.items()
     }
     predicted = model.simulate(v, channels=_led(channels, lead))
-    errors = {k: percent_of_stroke(goals[k], y[lead:]) for k, y in predicted.items()}
+    errors = {}
+    for k, one in found.items():
+        goal, whole = one.wanted[one.lead :], abs(model.axes[k].scaling.Y)
+        errors[k] = percent_of_stroke(goal, predicted[k][lead:], None if np.ptp(goal) else whole)
     return MultiAxisInverse(found, v, predicted, lead, errors)
 
 
@@ -180,6 +197,7 @@ def learn_axes(
     """
     if isinstance(model, StageModel):
         return {'y': Learning(model, wanted['y'], **options)}
+    model.require_chains('learn')
     drive = invert(model, wanted, clip=True, **options)
     moved = {motion_of(a): model.own(a).simulate(x.v)[x.lead :] for a, x in drive.items()}
     return {
@@ -190,7 +208,11 @@ def learn_axes(
 
 
 def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Array]:
-    """Return the wanted motion of every axis; raise DataError if the motions do not fit."""
+    """
+    Return the wanted motion of every axis; raise DataError if the motions do not fit.
+
+    Absent axes of a model with shared modes stay absent.
+    """
     if not isinstance(wanted, Mapping):
         raise DataError(
             f'invert: give the motion of each axis by its name, of {", ".join(model.axes)}'
@@ -200,10 +222,12 @@ def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -
         raise DataError(
             f'invert: {", ".join(unknown) or "no motion"}: the axes are {", ".join(model.axes)}'
         )
-    goals = {name: np.asarray(y, dtype=np.float64) for name, y in wanted.items()}
+    goals = {name: checked_motion(y) for name, y in wanted.items()}
     sizes = {y.size for y in goals.values()}
     if len(sizes) > 1:
         raise DataError('invert: the motions of the axes differ in length; give one a sample')
+    if model.modes is not None:
+        return goals
     rest = {a: model.own(a).simulate([x.scaling.range[0]])[0] for a, x in model.axes.items()}
     return {a: goals.get(a, np.full(max(sizes), rest[a])) for a in model.axes}
 

@@ -1,0 +1,113 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Invert a linear model of several axes by filters that look ahead.
+
+    Q(f) = (G* G + epsilon^2)^-1 G*
+
+G maps motions at rest to motions of the stage, in spans, so it is one at rest.
+`piezo_ident.control.linear_inverse` explains the filter for one axis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ModelError
+from piezo_ident.control.linear_inverse import LONGEST, OUTSIDE, REACH, ROUNDING, SHORTEST
+from piezo_ident.model.modes.modal import Modal
+from scipy.signal import oaconvolve
+
+#: largest condition of the gain at rest (taste: a motion of 0.1 um takes the voltage of 1 mm)
+SINGULAR = 1e4
+
+
+class AxesFilter(NamedTuple):
+    """
+    Filter of several axes that needs `ahead` samples after and `behind` samples before a sample.
+
+    Its `taps` have the shape (ahead + 1 + behind, outputs, inputs).
+    """
+
+    taps: Array
+    ahead: int
+    behind: int
+
+    @property
+    def reach(self) -> int:
+        """Distance beyond which a sample matters less than `REACH`."""
+        size = np.cumsum(np.abs(self.taps).sum(axis=(1, 2)))
+        first, last = np.searchsorted(size, size[-1] * np.array([REACH, 1.0 - REACH]))
+        return int(max(self.ahead - first, last - self.ahead, 0))
+
+    def __call__(self, x: Array) -> Array:
+        """Filter signals of shape (n, inputs) that rest before and after their samples."""
+        padded = np.pad(x, ((self.behind, self.ahead), (0, 0)), mode='edge')
+        return np.column_stack(
+            [
+                sum(oaconvolve(z, h, mode='valid') for z, h in zip(padded.T, row, strict=True))
+                for row in self.taps.transpose(1, 2, 0)
+            ]
+        )
+
+
+def static_gain(G: Modal, spans: Array) -> Array:
+    """Compute the gain at rest [spans/V]; ModelError if it has no inverse."""
+    static = G.response(np.ones(1, complex))[0].real / spans[:, None]
+    if not np.linalg.cond(static) < SINGULAR:
+        raise ModelError(
+            'these modes have no inverse: at rest, two axes move as one, or one not at all'
+        )
+    return np.asarray(static)
+
+
+def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, AxesFilter]:
+    """
+    Invert a linear model of several axes where its gain is not small.
+
+    Parameters
+    ----------
+    G : Modal
+    spans : ndarray, shape (axes,)
+        Displacements by which errors of the axes are compared [m].
+    least : float
+        Share of the static gain below which G is not inverted.
+
+    Returns
+    -------
+    Q, P : AxesFilter
+        The inverse, and G Q.  Their static gains are exact.
+
+    Raises
+    ------
+    ModelError
+        When G has no static gain, or needs a filter of more than `LONGEST` samples.
+    """
+    static = static_gain(G, spans)
+    n, left = SHORTEST, np.inf
+    while n <= LONGEST:
+        z = np.exp(2j * np.pi * np.fft.rfftfreq(n))
+        whole = G.response(z) / spans[:, None] @ np.linalg.inv(static)
+        back = whole.conj().swapaxes(1, 2)
+        Q = np.linalg.solve(back @ whole + least**2 * np.eye(len(spans)), back)
+        taps = [np.roll(np.fft.irfft(x, n, axis=0), n // 2, axis=0) for x in (Q, whole @ Q)]
+        size = np.abs(taps[0]).sum(axis=(1, 2))
+        before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
+        # an empty half proves that nothing wrapped around
+        last, left = left, float(before[n // 4] + after[-(n // 4)]) / float(before[-1])
+        if left < OUTSIDE or 0.5 * last < left < ROUNDING:
+            share = 0.5 * max(OUTSIDE, 4.0 * left) * float(before[-1])
+            start = min(int(np.searchsorted(before, share)), n // 2)
+            stop = max(n - int(np.searchsorted(after[::-1], share)), n // 2 + 1)
+            cut = [x[start:stop] @ np.linalg.inv(x[start:stop].sum(axis=0)) for x in taps]
+            of_spans = np.linalg.inv(static) @ cut[0] / spans, spans[:, None] * cut[1] / spans
+            inverse, passed = (AxesFilter(x, n // 2 - start, stop - 1 - n // 2) for x in of_spans)
+            return inverse, passed
+        n *= 2
+    raise ModelError(
+        f'these modes have no inverse of less than {LONGEST} samples: a zero of theirs dies away '
+        'too slowly; diagnose again with longer periods'
+    )

@@ -1,0 +1,384 @@
+# Copyright 2026 The piezo_ident authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Invert modes that several axes share: find voltages that move all axes along wanted motions.
+
+    m <- m + P (y_wanted - y(u)),        u = u_0 + Q m
+
+y(u) is the free run of the modes.  Q inverts a linear model of them by filters that look ahead,
+as `piezo_ident.control.linear_inverse` does for one axis.  P = G Q is nearly one where the stage
+moves, and small above its modes, so the iteration leaves alone what the stage cannot follow.
+
+Softening and plays are no part of a linear model.  A first pass runs the modes under the inverse
+without them.  Each signal p then gets the gain k for which k z is nearest to p in this run, and
+the linear model with these gains is inverted for the other passes.  The gains are the statistical
+linearisation of A. Gelb and W. E. Vander Velde, Multiple-Input Describing Functions and Nonlinear
+System Design, 1968.
+
+The passes are combined by the acceleration of D. G. Anderson, "Iterative procedures for nonlinear
+integral equations", J. ACM 12(4), 1965, doi:10.1145/321296.321305.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.control.axes_inverse import AxesFilter, inverse_filters, static_gain
+from piezo_ident.control.expectation import expect
+from piezo_ident.control.inputs import checked_limits, extrapolated, tolerance
+from piezo_ident.control.inverse import Inverse, LARGE, MATTERS, RESTS, STANDS, STILL
+from piezo_ident.control.linear_inverse import least_gain
+from piezo_ident.effects.slew_limit import SlewLimit
+from piezo_ident.model.metrics import percent, percent_of_stroke
+from piezo_ident.model.modes.modal import Modal, to_modal
+from piezo_ident.model.modes.shared_modes import SharedModes
+from piezo_ident.model.modes.stream import ModesStream
+from piezo_ident.model.multi_axis import alone, MultiAxisModel
+from piezo_ident.operators.chain import Block
+from scipy.ndimage import maximum_filter1d
+
+#: most passes, and passes in turn without a better one that end the iteration (taste)
+PASSES, STALLS = 40, 6
+#: rms error [of the span of the wanted motion] at which the iteration ends
+EXACT = 1e-5
+#: earlier passes that a step combines (taste: more find nothing in noise of 1e-6)
+DEPTH = 8
+#: most steps to the voltages of rest, and their accuracy [of the span of the model]
+STEPS, AT_REST = 50, 1e-9
+#: the iteration contracts if it leaves at most this share of the error of the linear inverse
+CONTRACTS = 0.5
+#: share of the time in which the level may exceed its range (taste)
+RARE = 0.1
+
+
+def equivalent(modes: SharedModes, gains: Array) -> Modal:
+    """Make the linear model in which each signal z pushes by its gain times z."""
+    one, e, h = modes.linear, modes.e * gains, modes.h * gains
+    return to_modal(
+        one.a + e @ modes.f, one.b + e @ modes.g, one.c + h @ modes.f, one.d + h @ modes.g
+    )
+
+
+def invert_modes(
+    model: MultiAxisModel,
+    modes: SharedModes,
+    wanted: Mapping[str, Array],
+    *,
+    limits: tuple[float, float] | None = None,
+    slew: float = np.inf,
+    clip: bool = False,
+    sample_rate: float | None = None,
+    like: object = None,
+) -> dict[str, Inverse]:
+    """
+    Find the voltages under which shared modes move all axes as wanted; see `piezo_ident.invert`.
+
+    Parameters
+    ----------
+    model : MultiAxisModel
+    modes : SharedModes
+        Of the model.
+    wanted : mapping of str to ndarray, shape (n,)
+        Displacement by axis [m].
+    limits, slew, clip, sample_rate
+        As for `piezo_ident.control.inverse.invert`, for each axis.
+    like : object, optional
+        Not used.
+
+    Returns
+    -------
+    dict of str to Inverse
+        All begin with the same sample.
+
+    Raises
+    ------
+    DataError
+        When the limits do not reach the wanted motion.
+    ModelError
+        When the modes have no inverse, or the iteration does not contract.
+    """
+    if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
+        raise DataError(
+            f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
+            f'{model.sample_rate:g} Hz; give the motion at that rate'
+        )
+    task = _Task(model, modes, wanted, limits, slew, clip)
+    best = _iterated(task)
+    return _results(task, best, clip)
+
+
+class _Pass(NamedTuple):
+    """Voltages about v0, error, samples out of reach, and rms error of the rest [spans]."""
+
+    u: Array
+    error: Array
+    missed: Mask
+    left: float
+    passes: int
+
+
+class _Task:
+    """Wanted motions of all axes in alphabetical order, with rest before and after them."""
+
+    def __init__(
+        self,
+        model: MultiAxisModel,
+        modes: SharedModes,
+        wanted: Mapping[str, Array],
+        limits: tuple[float, float] | None,
+        slew: float,
+        clip: bool,
+    ) -> None:
+        self.model, self.modes, self.axes = model, modes, sorted(model.axes)
+        each = [model.axes[a] for a in self.axes]
+        self.least = max(map(least_gain, each))
+        self.whole = np.array([abs(x.scaling.Y) for x in each])
+        bounds = np.array([checked_limits(x, limits, slew) for x in each])
+        self.low, self.high = (bounds[:, :2] - self.modes.v0[:, None]).T
+        self.step = float(bounds[0, 2])
+        self.static = self.whole[:, None] * static_gain(modes.linear, self.whole)
+        size = max(x.size for x in wanted.values())
+        # an axis without a motion rests where its voltage is that of the fit
+        columns = [wanted.get(a, np.full(size, np.nan)) for a in self.axes]
+        self.rest, first = self._rest(np.array([x[0] for x in columns]))
+        self.y = np.where(np.isnan(columns), first[:, None], columns).T
+        moved = np.ptp(self.y, axis=0)
+        # one at rest counts as the one that moves most
+        moves = moved > STANDS * self.whole
+        self.spans = np.where(moves, moved, moved.max() if moves.any() else self.whole)
+        self.small = MATTERS * np.minimum(self.spans, LARGE * self.whole)
+        self._keep_rest(clip)
+
+    def _rest(self, goal: Array) -> tuple[Array, Array]:
+        """
+        Find the voltages about v0 under which the modes rest at a goal, and where they rest.
+
+        Axes whose goal is NaN have the voltage of the fit.
+        """
+        u, free = np.zeros(len(goal)), ~np.isnan(goal)
+        for _ in range(STEPS):
+            y = ModesStream(self.modes).process((u + self.modes.v0)[None])[0]
+            e = (goal - y)[free]
+            if np.abs(e / self.whole[free]).max() < AT_REST:
+                break
+            u[free] += np.linalg.solve(self.static[np.ix_(free, free)], e)
+        return u, y
+
+    def _keep_rest(self, clip: bool) -> None:
+        """Keep the voltages of rest within the limits; raise DataError if they are far beyond."""
+        kept = np.clip(self.rest, self.low, self.high)
+        over = np.abs(self.static @ (self.rest - kept))
+        far = over > [max(t, s) for t, s in zip(self.tolerances, self.small, strict=True)]
+        if far.any() and not clip:
+            j = int(np.argmax(over / self.whole))
+            low, v, high = (x[j] + self.modes.v0[j] for x in (self.low, self.rest, self.high))
+            raise DataError(
+                f'the wanted motion of {self.axes[j]} starts at {1e6 * self.y[0, j]:.4g} um, '
+                f'which needs {v:.4g} V; the limits are {low:g} .. {high:g} V',
+                options='--clip',
+            )
+        self.rest = kept
+
+    @property
+    def tolerances(self) -> list[float]:
+        """Excess over the limits that is accepted on each axis [m]."""
+        columns = zip(self.axes, self.y.T, strict=True)
+        return [tolerance(self.model.axes[a], y) for a, y in columns]
+
+    def limited(self, u: Array) -> Array:
+        """Keep voltages about v0 within limits and slew."""
+        u = np.clip(u, self.low, self.high)
+        if np.isinf(self.step):
+            return u
+        t, columns = np.arange(len(u)) / self.model.sample_rate, []
+        for x in u.T:
+            guard = SlewLimit(self.model.sample_rate, {'limit': self.step})
+            guard.reset(float(x[0]), float(x[0]))
+            x = np.ascontiguousarray(x)
+            columns.append(guard.process(Block(t=t, v=x, x=x)).x)
+        return np.column_stack(columns)
+
+    def motion(self, u: Array) -> Array:
+        """Simulate the displacements under voltages about v0 [m]."""
+        return ModesStream(self.modes).process(u + self.modes.v0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Filters:
+    """Filters Q and P of a pass, and the wanted motion with the rest that Q needs."""
+
+    Q: AxesFilter
+    P: AxesFilter
+    x: Array
+
+    @classmethod
+    def of(cls, task: _Task, gains: Array) -> _Filters:
+        Q, P = inverse_filters(equivalent(task.modes, gains), task.whole, task.least)
+        return cls(Q, P, np.pad(task.y, ((Q.ahead, Q.behind), (0, 0)), mode='edge'))
+
+    def tried(self, task: _Task, m: Array, passes: int) -> _Pass:
+        """Run the modes under the voltages for motions m."""
+        free = task.rest + self.Q(m - self.x[0])
+        u = task.limited(free)
+        short = np.abs((free - u) @ task.static.T) > task.small
+        near = maximum_filter1d(short.any(axis=1), 2 * self.Q.reach + 1)
+        try:
+            error = self.x - task.motion(u)
+        except ModelError:  # ran away
+            return _Pass(u, np.full(u.shape, np.inf), short, np.inf, passes)
+        counted = np.where(near[:, None], 0.0, error) if not near.all() else error
+        within = self.P(counted) / task.spans
+        return _Pass(u, error, short, float(np.sqrt(np.mean(within**2))), passes)
+
+    def correction(self, now: _Pass) -> Array:
+        """Compute the step of the iteration [m]: what P passes of the error within reach."""
+        near = maximum_filter1d(now.missed.any(axis=1), 2 * self.Q.reach + 1)
+        return self.P(np.where(near[:, None], 0.0, now.error))
+
+
+class _Solved(NamedTuple):
+    """The best pass, and its filters."""
+
+    best: _Pass
+    filters: _Filters
+
+
+def _iterated(task: _Task) -> _Solved:
+    """Iterate until the error falls no more, or raise ModelError if it does not fall."""
+    first = _Filters.of(task, np.zeros(task.modes.signals))
+    begun = first.tried(task, first.x, 1)
+    filters, best = first, begun
+    if np.isfinite(begun.left) and task.modes.signals:
+        filters = _Filters.of(task, _gains(task.modes, begun.u))
+    m, steps, stalls = filters.x, _Anderson(), 0
+    for passes in range(2, PASSES + 1):
+        now = filters.tried(task, m, passes)
+        stalls = 0 if now.left < best.left else stalls + 1
+        if now.left < best.left or best is begun:
+            best, at = now, m
+        if best.left < EXACT or stalls > STALLS or not np.isfinite(best.left):
+            break
+        if not np.isfinite(now.left):
+            m, steps = 0.5 * (m + at), _Anderson()
+            continue
+        m = steps.next(m, filters.correction(now), task.spans)
+    if not (np.isfinite(best.left) and best.left <= max(CONTRACTS * begun.left, MATTERS)):
+        raise ModelError(
+            'invert: the iteration with the shared modes does not contract: '
+            f'{100 * best.left:.2g} % of the motion remain after {PASSES} passes, '
+            f'{100 * begun.left:.2g} % by the inverse of the linear modes; make the motion '
+            'smaller or slower'
+        )
+    return _Solved(best, filters)
+
+
+def _gains(modes: SharedModes, u: Array) -> Array:
+    """Compute the gain of each signal for which gain times z is nearest to p."""
+    run = modes.run(u)
+    z, p = (x - x.mean(axis=0) for x in (run.z, run.p))
+    size = np.sum(z**2, axis=0)
+    return np.where(size > 0.0, np.sum(z * p, axis=0) / np.where(size > 0.0, size, 1.0), 0.0)
+
+
+class _Anderson:
+    """Combines steps so that what they leave is least."""
+
+    def __init__(self) -> None:
+        self._points, self._steps = list[Array](), list[Array]()
+
+    def next(self, m: Array, step: Array, spans: Array) -> Array:
+        """Return the next point after m, whose step is known; errors count in spans."""
+        self._points, self._steps = [*self._points, m][-DEPTH:], [*self._steps, step][-DEPTH:]
+        if not self._points[1:]:
+            return m + step
+        moved, changed = np.diff(self._points, axis=0), np.diff(self._steps, axis=0)
+        columns = (changed / spans).reshape(len(changed), -1).T
+        shares = np.linalg.lstsq(columns, (step / spans).ravel(), rcond=STILL[-1])[0]
+        return np.asarray(m + step - np.tensordot(shares, moved + changed, axes=1))
+
+
+def _results(task: _Task, solved: _Solved, clip: bool) -> dict[str, Inverse]:
+    """Cut off the lead and tail at rest, and describe the drive of each axis."""
+    best, filters = solved
+    ahead = filters.Q.ahead
+    for still in (*STILL, 0.0):
+        away = np.abs((best.u - task.rest) @ task.static.T) > still * task.whole
+        moves = np.flatnonzero(away.any(axis=1))
+        first = max(min(ahead, int(moves[0]) - 1 if moves.size else ahead), 0)
+        used = slice(first, ahead + len(task.y))
+        predicted = task.motion(best.u[used])
+        if np.all(np.abs(filters.x[used] - best.error[used] - predicted) < RESTS * task.spans):
+            break
+    near = maximum_filter1d(best.missed[used].any(axis=1), 2 * filters.Q.reach + 1)
+    drive = _Drive(best.u[used], filters.x[used], predicted, ahead - first, near, best.passes)
+    late = _level_warnings(task, drive.u)
+    return {axis: _of_axis(task, j, drive, late, clip) for j, axis in enumerate(task.axes)}
+
+
+class _Drive(NamedTuple):
+    """Voltages about v0, wanted and predicted motions, lead, samples near missed ones, passes."""
+
+    u: Array
+    wanted: Array
+    predicted: Array
+    lead: int
+    near: Mask
+    passes: int
+
+
+def _of_axis(task: _Task, j: int, drive: _Drive, late: list[str], clip: bool) -> Inverse:
+    """Describe the drive of an axis; raise DataError if the limits do not reach its motion."""
+    axis, y, span = task.axes[j], task.y[:, j], float(task.spans[j])
+    model, v = alone(task.model)[axis], drive.u[:, j] + task.modes.v0[j]
+    error = drive.wanted[:, j] - drive.predicted[:, j]
+    clipped, warnings = drive.near & (np.abs(error) > task.small[j]), list(late)
+    if clipped.any():
+        most = float(np.abs(error[clipped]).max())
+        warnings.append(
+            f'{np.count_nonzero(clipped)} samples of the wanted motion of {axis} are out of reach '
+            f'within the limits: by up to {1e6 * most:.3g} um'
+        )
+        if not clip and most > task.tolerances[j]:
+            raise DataError(warnings[-1], options='--clip')
+    expected, reached = expect(model, v, y), error[~drive.near]
+    left = float(np.sqrt(np.mean(reached**2))) / span if reached.size else 0.0
+    if left > max(MATTERS, 0.0 if expected.rms is None else expected.rms / span):
+        warnings.append(
+            f'the drive misses {100 * left:.2g} % of the wanted motion of {axis} within all '
+            'limits: the motion is faster than the stage, or jumps'
+        )
+    return Inverse(
+        model=task.model.axes[axis],
+        t=(np.arange(v.size) - drive.lead) / task.model.sample_rate,
+        v=v,
+        wanted=drive.wanted[:, j],
+        predicted=drive.predicted[:, j],
+        lead=drive.lead,
+        clipped=clipped,
+        passes=drive.passes,
+        error=percent_of_stroke(y, drive.predicted[drive.lead :, j], span),
+        expected=None if expected.rms is None else percent(expected.rms, span),
+        expected_rms=expected.rms,
+        expected_offset=None,
+        warnings=(*warnings, *extrapolated(model, v, y), *expected.warnings),
+    )
+
+
+def _level_warnings(task: _Task, u: Array) -> list[str]:
+    """Warn of motions larger than those of the fit, whose softening is not known."""
+    if not task.modes.levels:
+        return []
+    high, level = task.modes.range[1], np.sqrt(task.modes.run(u).level)
+    beyond = float(np.mean(level > high))
+    if beyond <= RARE:
+        return []
+    return [
+        f'for {beyond:.0%} of the time the motion is larger than that of the fit: its level is '
+        f'up to {level.max():.2g}, and the modes hold up to {high:.2g}'
+    ]
