@@ -93,11 +93,7 @@ def export_c(
         Whether the header has a feed-forward.
     """
     expect(model, StageModel, 'export, first argument', 'read a model with load')
-    if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
-        raise ConfigError(
-            f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
-            options='--name stage',
-        )
+    checked_name(name)
     kept = checked_limits(model, limits, slew)
     if preview is not None:
         check_preview(model, preview)
@@ -243,6 +239,15 @@ def _says(
 
 def _named(links: Sequence[Link]) -> str:
     return ', '.join(link.name for link in links if link.code.step)
+
+
+def checked_name(name: str) -> None:
+    """Refuse a name that is not allowed in C with a ConfigError."""
+    if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
+        raise ConfigError(
+            f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
+            options='--name stage',
+        )
 
 
 def plain_text(text: str) -> str:

@@ -11,6 +11,7 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.export.header import export_c as export_axis
 from piezo_ident.export.header import plain_text
 from piezo_ident.export.links import LinkGroup, links_of
+from piezo_ident.export.modes_header import export_modes
 from piezo_ident.model.axis_records import MOTION, motion_of, voltage_of
 from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
@@ -34,7 +35,8 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     str
         C99 without dependencies.  A comment at its head explains the calls, and names the effects
         that the feed-forward leaves uncorrected.  A model of several axes has a header for each
-        axis, then a step of the stage that takes all voltages.
+        axis, then a step of the stage that takes all voltages.  Modes that the axes share have
+        such a step without a feed-forward.
 
     Raises
     ------
@@ -54,7 +56,8 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     """
     if not isinstance(model, MultiAxisModel):
         return export_axis(model, name, **options)
-    model.require_chains('export')
+    if model.modes is not None:
+        return export_modes(model, model.modes, name, **options)
     tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
     alike = [axis for axis in tags if [*tags.values()].count(tags[axis]) > 1]
     if alike:

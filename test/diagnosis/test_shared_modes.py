@@ -122,7 +122,6 @@ def test_the_file_of_shared_modes_reads_back_bit_by_bit(tmp_path):
 @pytest.mark.parametrize(
     'verb',
     [
-        pi.export_c,
         lambda model: pi.diagnose(model, measured()),
         lambda model: pi.free_run(model, measured(), 0.9),
     ],

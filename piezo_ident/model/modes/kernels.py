@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.kernel import alive, kernel
+from piezo_ident.common.kernel import alive, kernel, ordered_kernel
 
 #: what a parameter is, by number: two numbers a block of A, then entries of matrices
 KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')
@@ -75,7 +75,7 @@ class Passage(NamedTuple):
     y: Array
 
 
-@kernel
+@ordered_kernel
 def trajectory(u: Array, loop: Loop, state: LoopState, run: Passage) -> int:
     """
     Run the loop over u, move `state` on, and write the signals into `run`.
