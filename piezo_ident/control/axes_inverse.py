@@ -59,7 +59,7 @@ def static_gain(G: Modal, spans: Array) -> Array:
     static = G.response(np.ones(1, complex))[0].real / spans[:, None]
     if not np.linalg.cond(static) < SINGULAR:
         raise ModelError(
-            'these modes have no inverse: at rest, two axes move as one, or one not at all'
+            'these modes have no inverse: at rest, two axes move as one, or one stands still'
         )
     return np.asarray(static)
 

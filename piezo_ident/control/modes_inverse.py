@@ -7,14 +7,14 @@ Invert modes that several axes share: find voltages that move all axes along wan
     m <- m + P (y_wanted - y(u)),        u = u_0 + Q m
 
 y(u) is the free run of the modes.  Q inverts a linear model of them by filters that look ahead,
-as `piezo_ident.control.linear_inverse` does for one axis.  P = G Q is nearly one where the stage
-moves, and small above its modes, so the iteration leaves alone what the stage cannot follow.
+see `piezo_ident.control.axes_inverse`.  P = G Q is nearly one where the stage moves, and small
+above its modes.  The iteration therefore leaves alone the motion that is too fast for the stage.
 
 Softening and plays are no part of a linear model.  A first pass runs the modes under the inverse
-without them.  Each signal p then gets the gain k for which k z is nearest to p in this run, and
-the linear model with these gains is inverted for the other passes.  The gains are the statistical
-linearisation of A. Gelb and W. E. Vander Velde, Multiple-Input Describing Functions and Nonlinear
-System Design, 1968.
+without them.  Each signal z then gets a gain k.  The gain is chosen such that k z is nearest to
+the push p of this run.  The other passes invert the linear model with these gains.  The gains are
+the statistical linearisation of A. Gelb and W. E. Vander Velde, Multiple-Input Describing
+Functions and Nonlinear System Design, 1968.
 
 The passes are combined by the acceleration of D. G. Anderson, "Iterative procedures for nonlinear
 integral equations", J. ACM 12(4), 1965, doi:10.1145/321296.321305.
@@ -136,7 +136,8 @@ class _Task:
         clip: bool,
     ) -> None:
         self.model, self.modes, self.axes = model, modes, sorted(model.axes)
-        each = [model.axes[a] for a in self.axes]
+        self.models = alone(model)
+        each = [self.models[a] for a in self.axes]
         self.least = max(map(least_gain, each))
         self.whole = np.array([abs(x.scaling.Y) for x in each])
         bounds = np.array([checked_limits(x, limits, slew) for x in each])
@@ -189,7 +190,7 @@ class _Task:
     def tolerances(self) -> list[float]:
         """Excess over the limits that is accepted on each axis [m]."""
         columns = zip(self.axes, self.y.T, strict=True)
-        return [tolerance(self.model.axes[a], y) for a, y in columns]
+        return [tolerance(self.models[a], y) for a, y in columns]
 
     def limited(self, u: Array) -> Array:
         """Keep voltages about v0 within limits and slew."""
@@ -335,7 +336,7 @@ class _Drive(NamedTuple):
 def _of_axis(task: _Task, j: int, drive: _Drive, late: list[str], clip: bool) -> Inverse:
     """Describe the drive of an axis; raise DataError if the limits do not reach its motion."""
     axis, y, span = task.axes[j], task.y[:, j], float(task.spans[j])
-    model, v = alone(task.model)[axis], drive.u[:, j] + task.modes.v0[j]
+    model, v = task.models[axis], drive.u[:, j] + task.modes.v0[j]
     error = drive.wanted[:, j] - drive.predicted[:, j]
     clipped, warnings = drive.near & (np.abs(error) > task.small[j]), list(late)
     if clipped.any():
@@ -379,6 +380,6 @@ def _level_warnings(task: _Task, u: Array) -> list[str]:
     if beyond <= RARE:
         return []
     return [
-        f'for {beyond:.0%} of the time the motion is larger than that of the fit: its level is '
-        f'up to {level.max():.2g}, and the modes hold up to {high:.2g}'
+        f'for {beyond:.0%} of the time the motion is larger than in the fit: its level is up to '
+        f'{level.max():.2g}, and the modes hold up to {high:.2g}'
     ]

@@ -69,11 +69,14 @@ class SharedModesFinding(NamedTuple):
     Modes with hysteresis inside their loop, fitted to all multisines, and their law.
 
     `errors` are those of each law and of ``chains`` on the multisines held out, % of rms(y).
+    `held_out` has the mean squared error of the law on them [m^2], in alphabetical order of the
+    axes, by the label of each segment of the same amplitude.
     """
 
     modes: SharedModes
     law: str
     errors: Mapping[str, float]
+    held_out: Mapping[str, Array]
 
 
 def find_shared_modes(
@@ -115,7 +118,9 @@ def _found(
         return None
     modes = loop_fit(fitted[law], every, iterations=LAST_STEPS)
     progress('shared modes', 1.0)
-    return SharedModesFinding(replace(modes, v0=v0), law, errors)
+    missed = search.missed(fitted[law])
+    held_out = {record.name: missed[record.group] for record in every}
+    return SharedModesFinding(replace(modes, v0=v0), law, errors, held_out)
 
 
 def _steady(chains: MultiAxisModel, records: Sequence[PeriodicRecord], v0: Array) -> list[Array]:
@@ -185,6 +190,12 @@ class LawSearch:
         except ModelError:
             return float('inf')
         return percent_of(self.held_out, answers)
+
+    def missed(self, model: SharedModes) -> dict[str, Array]:
+        """Compute the mean squared error of a model on the record held out of each group."""
+        answers = [r.error(model.steady(r.u[-1])) for r in self.held_out]
+        of_groups = zip(self.groups, answers, strict=True)
+        return {group: np.nanmean(e**2, axis=0) for group, e in of_groups}
 
     def modes_move(self) -> bool:
         """Tell whether linear models of each amplitude err less with modes of their own."""

@@ -4,8 +4,8 @@
 """
 Export modes that several axes share as a C header: prediction, sample by sample.
 
-The sums have the order of `piezo_ident.model.modes.kernels.trajectory`, so C and Python agree to
-the last bit if the compiler does not contract products and sums.
+The sums have the order of `piezo_ident.model.modes.kernels.trajectory`.  C and Python therefore
+agree to the last bit, unless the compiler contracts products and sums.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def export_modes(
     title : str, optional
         First line of the header.
     feedforward : bool, optional
-        Not used: there is none.
+        Has no effect, as there is none.
     **drive
         Settings of a feed-forward, which are refused.
 

@@ -18,9 +18,15 @@ from piezo_ident.common.arrays import Array, line_between
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import BlockClock, Kind
-from piezo_ident.model.axis_records import MOTION, motion_of
+from piezo_ident.model.axis_records import motion_of
 from piezo_ident.model.modes.stream import ModesRun
-from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel
+from piezo_ident.model.multi_axis import (
+    alone,
+    judged_models,
+    models_of,
+    MultiAxisModel,
+    require_voltages_only,
+)
 from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
@@ -103,7 +109,7 @@ class AxesRun:
 def run_of(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> AxesRun | ModesRun:
     """Begin a run of a model, with the axes in this order."""
     if isinstance(model, MultiAxisModel) and model.modes is not None:
-        return ModesRun(model.modes, axes)
+        return ModesRun(model.modes, axes, doubts=bool(_with_band(model, axes)))
     return AxesRun(model, axes)
 
 
@@ -115,17 +121,6 @@ def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
             f'the model holds for {", ".join(held)}, and this node for {", ".join(axes)}: start '
             "the node with the parameter 'axes' of the stage"
         )
-
-
-def channels_of(model: StageModel | MultiAxisModel) -> list[tuple[str, str]]:
-    """List the effects that need a measured channel, each with the channel."""
-    several = isinstance(model, MultiAxisModel)
-    return [
-        (effect.name, effect.channel)
-        for x in models_of(model).values()
-        for effect in x.effects
-        if effect.channel and not (several and effect.channel.startswith(MOTION))
-    ]
 
 
 class Predictor:
@@ -185,14 +180,15 @@ class Predictor:
         """
         Whether the memory of the plays is known.
 
-        The lower end of the voltage range makes it known, until the next gap or new run.  So does
-        a sweep of all plays of shared modes.
+        The lower end of the voltage range, or a sweep of shared modes, makes it known until a gap.
         """
-        run = self._run
-        if self.model is None:
+        return self._was_at_rest or (isinstance(self._run, ModesRun) and self._run.stream.is_swept)
+
+    @property
+    def _was_at_rest(self) -> bool:
+        """Whether the run has been at the lower end of the voltage range."""
+        if self.model is None or (isinstance(run := self._run, ModesRun) and run.is_partial):
             return False
-        if isinstance(run, ModesRun) and (run.is_partial or run.stream.is_swept):
-            return run.stream.is_swept
         each = models_of(self.model)
         return all(
             each[a].scaling.u(v) < REST for a, v in zip(self._axes, self._lowest, strict=True)
@@ -211,16 +207,11 @@ class Predictor:
         its effects needs a further channel.
         """
         check_axes(model, self._axes)
-        for name, channel in channels_of(model):
-            raise ModelError(
-                f'effect {name} needs the further channel {channel!r}, which '
-                'does not come with the voltage; take the effect out of the model'
-            )
+        require_voltages_only(model)
         if np.isfinite(self._clock.period):
             self._check_rate(model)
-        for one in _with_band(model):
-            # a damaged band is refused now, not in the stream
-            band_of(one)
+        for one in _with_band(model, self._axes):
+            band_of(one)  # a damaged band is refused now, not in the stream
         run = None
         if self._pasts[0]:
             run = run_of(model, self._axes)
@@ -293,13 +284,16 @@ class Predictor:
         return Samples(t, y, samples.segment, 'displacement')
 
     def _half_width(self, v: Array, y: Array) -> Array | None:
-        models = [] if self.model is None else _with_band(self.model)
+        models = [] if self.model is None else _with_band(self.model, self._axes)
         if len(models) < len(self._axes):
             return None
         if not self._bands:
-            known = self.memory_known
+            known = self.memory_known or isinstance(self._run, ModesRun)
             self._bands = [BandStream(x, self._level, plays=known, creep=False) for x in models]
-        return np.stack([band.follow(*of) for band, *of in zip(self._bands, v, y, strict=True)])
+        half = np.stack([band.follow(*of) for band, *of in zip(self._bands, v, y, strict=True)])
+        if isinstance(self._run, ModesRun) and not self._was_at_rest:
+            half += self._level * self._run.spread
+        return half
 
     def _usable(self, t: Array, v: Array) -> bool:
         if problem := time_problem(t):
@@ -330,7 +324,7 @@ class Predictor:
         self._advance(line_between(t0, t1, missing), between)
         self._lowest = [float('inf')] * len(self._axes)
         if isinstance(self._run, ModesRun):
-            self._run.stream.forget()
+            self._run.forget()
 
     def _advance(self, t: Array, v: Array) -> Array | None:
         self._remember(t, v)
@@ -358,9 +352,10 @@ class Predictor:
             past.add(t, v[k])
 
 
-def _with_band(model: StageModel | MultiAxisModel) -> list[StageModel]:
-    """List the models of the axes that carry a band."""
-    return [x for x in models_of(model).values() if KEY in x.identification]
+def _with_band(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> list[StageModel]:
+    """List the models of the axes that carry a band, in the order of the axes."""
+    each = judged_models(model)
+    return [each[axis] for axis in axes if KEY in each[axis].identification]
 
 
 def warm_up() -> None:

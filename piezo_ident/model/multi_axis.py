@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 T = TypeVar('T')
 
+#: entry below `identification` of an axis with what is known of its prediction by shared modes
+SHARED_MODES = 'shared_modes'
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EachAxis(Mapping[str, T], Generic[T]):
@@ -297,17 +300,41 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     return {'y': model} if isinstance(model, StageModel) else model.axes
 
 
+def require_voltages_only(model: StageModel | MultiAxisModel) -> None:
+    """Refuse a model with an effect that needs a measured channel, with a ModelError."""
+    several = isinstance(model, MultiAxisModel)
+    for effect in (effect for x in models_of(model).values() for effect in x.effects):
+        if effect.channel and not (several and effect.channel.startswith(MOTION)):
+            raise ModelError(
+                f'effect {effect.name} needs the further channel {effect.channel!r}, which '
+                'does not come with the voltage; take the effect out of the model'
+            )
+
+
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """
     List the model of each axis without the paths of the others.
 
-    Effects of chains are no part of a prediction by shared modes, and are left out.
+    Beside shared modes, effects and known errors of a chain are no part of a prediction.  The
+    models then have no effects, and errors and band of the modes.
     """
     if isinstance(model, StageModel):
         return {'y': model}
     if model.modes is not None:
-        return {a: replace(x, effects=()) for a, x in model.axes.items()}
+        return {a: _beside_modes(x) for a, x in model.axes.items()}
     return {a: model.own(a) for a in model.axes}
+
+
+def judged_models(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
+    """List the model of each axis with the known errors and the band of its prediction."""
+    shares = isinstance(model, MultiAxisModel) and model.modes is not None
+    return alone(model) if shares else models_of(model)
+
+
+def _beside_modes(model: StageModel) -> StageModel:
+    known = model.identification.get(SHARED_MODES)
+    known = known if isinstance(known, Mapping) else {}
+    return replace(model, effects=(), identification=dict(known))
 
 
 def with_own(

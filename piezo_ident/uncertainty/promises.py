@@ -9,8 +9,7 @@ the error of held-out samples.  The promise for motion of another kind is the ge
 times that of r_k (`piezo_ident.uncertainty.band`).  It is over all pairs of a swing, with its
 nesting, of one kind and a speed of another.  About half of the kinds err more.
 
-After a diagnosis the errors are those of the refined model.  It carries nothing that follows time
-alone, so hum, drift and a wandering gain count in full.
+After a diagnosis the refined model carries no hum, drift or wandering gain: they count in full.
 
 Limits: both are for the rms error over a whole record, in % of the stroke of the records that they
 come from.  The zero of the sensor does not count where it has clearly moved.
@@ -49,7 +48,7 @@ def promised_identification(result: Identification, judged: Judged) -> Identific
     if blocks is None:
         return result
     band = calibrated(blocks)
-    promise = _promise(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
+    promise = promise_of(blocks, blocks, band, abs(model.scaling.Y), result.stroke)
     if not judged.tests_other_motion:
         promise = replace(promise, other=None)
     return replace(result, model=with_band(model, band), promise=promise)
@@ -68,7 +67,7 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     if same is None or other is None:
         return result
     band = calibrated(other)
-    promise = _promise(same, other, band, abs(model.scaling.Y), stroke)
+    promise = promise_of(same, other, band, abs(model.scaling.Y), stroke)
     if result.changes:
         # the deviations belong to the given model
         known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
@@ -77,9 +76,10 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     return replace(result, sentence=sentence(result))
 
 
-def _promise(
+def promise_of(
     same: Blocks, other: Blocks, band: PredictionBand, span: float, stroke: float
 ) -> Promise:
+    """Promise the error of another record, from blocks of its kind and of other kinds."""
     mean = float(np.average(same.square, weights=same.weight))
     swing, speed, nesting = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2, 3))
     k, m = (x.ravel() for x in np.indices((other.kinds, other.kinds)))

@@ -27,6 +27,7 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
 from piezo_ident.uncertainty.parameters import with_deviations
 from piezo_ident.uncertainty.promises import promised_diagnosis, promised_identification
+from piezo_ident.verbs.promised_modes import promised_modes
 
 #: largest change of a voltage at rest, as a share of its range
 RESTS = 1e-3
@@ -231,7 +232,13 @@ def diagnose(
     judged = functools.partial(
         with_shared_modes, finding=shared, model=found.model, records=records
     )
-    return found.mapped(lambda axis, x: judged(x, axis))
+    order = sorted(found)
+
+    def judged_and_promised(axis: str, x: Diagnosis) -> Diagnosis:
+        own = {label: float(of[order.index(axis)]) for label, of in shared.held_out.items()}
+        return promised_modes(judged(x, axis), own)
+
+    return found.mapped(judged_and_promised)
 
 
 def _named(progress: Progress, axis: str) -> Progress:

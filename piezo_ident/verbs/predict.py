@@ -20,6 +20,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
 from piezo_ident.uncertainty.prediction import half_widths, with_interval
+from piezo_ident.verbs.shared_modes import modes_half_widths, with_half_widths
 
 
 @overload
@@ -95,9 +96,11 @@ def free_run(
         )
     kept = {axis: seen[axis] for axis in axes or model.axes}
     if model.modes is not None:
+        runs = _of_modes(model, model.modes.settling, record, kept)
         if interval is not None:
-            model.require_chains('a band of the error')
-        return EachAxis(_of_modes(model, model.modes.settling, record, kept))
+            half = modes_half_widths(model, model.modes, record, interval)
+            runs = {a: with_half_widths(x, interval, half[a]) for a, x in runs.items()}
+        return EachAxis(runs)
     return EachAxis({axis: free_run(model.axes[axis], x, interval) for axis, x in kept.items()})
 
 
@@ -130,9 +133,10 @@ def bands(
     interval: float,
 ) -> dict[str, tuple[Array, ...]]:
     """Compute the half widths [m] of predictions from voltages alone, by axis."""
+    if isinstance(model, MultiAxisModel) and model.modes is not None:
+        half = modes_half_widths(model, model.modes, record, interval)
+        return {axis: half[axis] for axis in predicted}
     models = models_of(model)
-    if isinstance(model, MultiAxisModel):
-        model.require_chains('a band of the error')
     seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
     return {k: half_widths(models[k], seen[k], x, interval) for k, x in predicted.items()}
 

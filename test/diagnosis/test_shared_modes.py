@@ -119,16 +119,31 @@ def test_the_file_of_shared_modes_reads_back_bit_by_bit(tmp_path):
         pi.load(tmp_path / 'model.yaml')
 
 
-@pytest.mark.parametrize(
-    'verb',
-    [
-        lambda model: pi.diagnose(model, measured()),
-        lambda model: pi.free_run(model, measured(), 0.9),
-    ],
-)
-def test_verbs_that_run_chains_alone_refuse_shared_modes(verb):
+def test_a_further_diagnosis_refuses_shared_modes():
     with pytest.raises(ModelError, match='modes that the axes share'):
-        verb(diagnosed().model)
+        pi.diagnose(diagnosed().model, measured())
+
+
+def test_band_and_promise_of_shared_modes_hold_on_another_record():
+    result = diagnosed()
+    other = replace(STAGE, seed=5).play(replace(program('large', realisations=2), seed=77))
+    for axis, run in pi.free_run(result.model, other, 0.9).items():
+        assert 0.75 < run.inside <= 1.0
+        assert np.median(run.half_widths[0]) < 5 * np.std(run.measured - run.predicted)
+        assert 0.5 < run.errors.percent / result[axis].promise.same < 2.0
+
+
+def test_the_error_of_an_inverse_is_expected_from_the_modes():
+    model, t = diagnosed().model, np.arange(4000) / STAGE.sample_rate
+    soft = np.minimum(1.0, np.minimum(t, t[::-1]) / 0.2) ** 2
+    rest = {a: float(y[0]) for a, y in model.simulate({'v': [5.0], 'v_b': [5.0]}).items()}
+    wanted = {
+        a: rest[a] + 0.2 * model.axes[a].scaling.Y * soft * np.sin(2 * np.pi * f * t)
+        for a, f in (('y', 30.0), ('y_b', 7.0))
+    }
+    drive = pi.invert(model, wanted)
+    for axis, one in drive.items():
+        assert drive.errors[axis] < 0.1 < one.expected
 
 
 def test_a_linear_stage_shares_no_loop():

@@ -49,7 +49,7 @@ class LineResponse:
 
     @property
     def size(self) -> Array:
-        """The rms of the response of each output, 1 where there is none; shape (outputs, 1)."""
+        """Compute the rms response of each output, shape (outputs, 1); a zero becomes 1."""
         size = np.sqrt(np.mean(np.abs(self.g) ** 2, axis=(0, 2)))[:, None]
         return np.where(size > 0, size, 1)
 
@@ -58,7 +58,7 @@ def excited_lines(records: Sequence[PeriodicRecord]) -> NDArray[np.intp]:
     """Return the lines, without the mean, that every input excites on average over the records."""
     power = np.mean([np.abs(np.fft.rfft(r.mean_u, axis=0)) ** 2 for r in records], axis=0)
     power[0] = 0
-    # what a few records excite alone is noise beside what all of them do
+    # lines that few records excite are noise beside the common lines
     return np.flatnonzero((power > EXCITED**2 * power.max(axis=0)).all(axis=1))
 
 

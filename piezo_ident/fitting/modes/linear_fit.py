@@ -109,7 +109,7 @@ def choose_order(
     Returns
     -------
     Modal
-        Of the lowest order whose error another order does not beat by more than `WORTH`.
+        The lowest order of those whose error is within `WORTH` of the least.
     dict
         Error in % of each order that was tried.
     """

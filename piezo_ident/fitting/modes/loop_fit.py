@@ -6,8 +6,8 @@ Everything in a loop model fitted at once by its error in free run.
 
 Levenberg-Marquardt on the steady state of periodic records of all amplitudes together, with the
 sensitivities of `piezo_ident.model.modes.kernels`.  The error of each output of each record is
-divided by its rms, so small amplitudes count as much as large ones, and an axis of a short stroke
-as much as one of a long one.
+divided by its rms.  Small and large amplitudes therefore count alike, and so do short and long
+strokes.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def output_sensitivities(
     """
     Return dy/dtheta of `parameters`, shape (samples - skip, outputs, parameters).
 
-    `run` is what passed in the loop under u.
+    `run` holds the signals of the loop under u.
     """
     out = np.zeros((len(u) - skip, len(model.h), len(parameters)), np.float32)
     kinds, rows, columns = parameters.kinds, parameters.rows, parameters.columns
@@ -153,7 +153,7 @@ def loop_fit(
     Returns
     -------
     SharedModes
-        Its modes are stable over its range of levels, which is what the records often reach.
+        Its modes are stable over its range of levels, which the records often reach.
     """
     model = _ranged(model, records)
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -172,7 +172,7 @@ def _ranged(model: SharedModes, records: Sequence[PeriodicRecord]) -> SharedMode
         u = record.mean_u
         try:
             level = np.sqrt(free.run(np.concatenate([u, u])).level[len(u) :])
-        except ModelError:  # what keeps it from running away is its range
+        except ModelError:  # the range alone keeps it from running away
             return model
         reached = np.quantile(level, (RARE, 1 - RARE))
         low, high = min(low, float(reached[0])), max(high, float(reached[1]))
@@ -198,7 +198,7 @@ class _Problem:
         for record in records:
             u, y = record.mean_u, record.mean_y
             before = u[len(u) - self.warm_up :]
-            # a phase at which no period was read does not count
+            # a phase counts if one period at least was read there
             scale = record.sound.any(axis=0) * (record.weight / np.sqrt(np.mean(y**2, axis=0)))
             self.targets.append((np.concatenate([before, u]), y, scale))
 

@@ -4,8 +4,8 @@
 """
 Cut whole periods of multisines out of records of several axes.
 
-A stage in steady state under a periodic voltage repeats itself.  A period that differs from the
-next one holds noise, or the stage changed between the two: such a record counts less in a fit.
+A stage in steady state under a periodic voltage repeats itself.  Two periods differ by noise, or
+because the stage changed.  A record with a large difference counts less in a fit.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from piezo_ident.record.channels import Axes
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
 
-#: a record that differs between periods by so many times the median of all changed (three
-#: standard deviations, and then some: the spread of the mirror's sound records is 2.4)
+#: largest difference between periods of a sound record, in medians over all records.  Sound
+#: records of the mirror differ by up to 2.4
 SUSPICIOUS = 3.0
-#: passes in which lost readings and the mean of a period are found from one another; each pass
-#: leaves the lost share of the error
+#: passes that find lost readings and the mean of a period from one another.  Each pass leaves the
+#: lost share of the error
 TURNS = 3
 #: most periods of one segment (taste)
 PERIODS = 64
@@ -154,7 +154,7 @@ def periods_of(records: Sequence[Record]) -> tuple[tuple[PeriodicRecord, ...], A
     """
     Find the periods in which all axes move at once.
 
-    Of three periods or more the first is left out, because the stage settles in it.  A piece
+    The stage settles in the first period, which is left out of three or more.  A piece
     without segments is one segment with the name of its record.  Segments named alike but for a
     number at the end are one group.  Periods of the most frequent length are taken.
 

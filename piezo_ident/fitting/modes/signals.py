@@ -4,9 +4,9 @@
 """
 Signals inside the loop that a model may gain: softening, plays in the mechanics, plays of inputs.
 
-A signal begins as something that can be named, the extension of the actuators G(0)^-1 y or their
-voltages, of rms 1 over the records it is made for; a fit then mixes motion and voltage anew.  It
-begins without effect: E and H are zero.
+A signal begins as the extension of the actuators, G(0)^-1 y, or as their voltages.  Its rms over
+the records of the fit is 1.  It begins without effect: E and H are zero.  A fit then mixes motion
+and voltage anew.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def with_input_plays(model: SharedModes, records: Sequence[PeriodicRecord]) -> S
 
 
 def _extension(model: SharedModes) -> tuple[Array, Array]:
-    """Return F and G of G(0)^-1 y: what the outputs would take of the inputs at rest."""
+    """Return F and G of G(0)^-1 y: the voltages that would hold the outputs at rest."""
     gain = model.linear.response(np.ones(1, complex))[0].real
     back = np.linalg.pinv(gain)
     return back @ model.linear.c, back @ model.linear.d

@@ -4,9 +4,9 @@
 """
 A modal model from a frequency response, without a start: subspace of the frequency domain.
 
-McKelvey, Akcay and Ljung (1996), doi:10.1109/9.508900: G at the lines spans the observability
-matrix of the stage, once what the inputs span is projected off; A is what shifts it by one row.
-B, C and D then follow by least squares, in turns.
+The method is that of McKelvey, Akcay and Ljung (1996), doi:10.1109/9.508900.  The span of the
+inputs is projected off the response at the lines.  The rest spans the observability matrix of the
+stage.  A shifts this matrix by one row.  B, C and D follow by least squares, in turns.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def subspace(response: LineResponse, order: int) -> Modal:
 
 
 def _observability(response: LineResponse, rows: int) -> Array:
-    """Return an orthonormal basis of what G spans and the inputs do not, strongest first."""
+    """Return an orthonormal basis of the span of G off that of the inputs, strongest first."""
     inputs = response.g.shape[2]
     powers = response.z[None, :] ** np.arange(rows)[:, None]
     spans = []

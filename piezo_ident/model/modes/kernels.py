@@ -2,18 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The compiled loops of a stage with softening and plays inside its loop, and its sensitivities.
+Run modes with softening and plays inside their loop, and compute their sensitivities.
 
-    z(k) = F x(k) + G u(k)
-    p_j(k) = z_j(k) (clip(s(k)) - 1)                   j < levels: softening
-    p_j(k) = sum_i mu_ji F_ri[z_j](k)                  the others: plays (eqs. 1-2)
-    s(k)^2 = l(k),  l(k+1) = kappa l(k) + (1 - kappa) mean_{j < levels} z_j(k)^2
-    x(k+1) = A x(k) + B u(k) + E p(k),    y(k) = C x(k) + D u(k) + H p(k)
+`piezo_ident.model.modes.shared_modes` has the equations.  The plays are those of Gu, Li, Zhu and
+Su (2016), doi:10.1109/TMECH.2015.2465868.  The squared level of the softening is a running mean:
 
-with F_r the play of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868.
+    l(k+1) = kappa l(k) + (1 - kappa) mean_j z_j(k)^2
 
-Sensitivities run beside the trajectory, in single precision, some parameters at once so that they
-stay in the cache: the derivative of a play is that of z where z drives it, and stands otherwise.
+Sensitivities are derivatives of the displacements with respect to parameters.  They run beside the
+trajectory, in single precision.  A few parameters run together, so that they stay in the cache.
+
+A play that moves with z has the derivative of z.  A play that stands keeps its derivative.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, kernel, ordered_kernel
 
-#: what a parameter is, by number: two numbers a block of A, then entries of matrices
+#: kinds of parameters, by number: two numbers a block of A, then entries of matrices
 KINDS = ('poles', 'b', 'e', 'f', 'g', 'mu')
 #: parameters that run through the loop together
 CHUNK = 64
@@ -59,7 +58,7 @@ class LoopState(NamedTuple):
 
     @classmethod
     def at_zero(cls, loop: Loop) -> LoopState:
-        """Make the state of a stage that never moved; its level is that of the fit."""
+        """Make the state of a stage that never moved, at the level of the fit."""
         return cls(np.zeros(len(loop.b)), np.zeros(loop.mu.shape), np.ones(1))
 
 

@@ -4,15 +4,28 @@
 """
 Modes that several axes share, with softening and hysteresis inside their loop.
 
-    x(k+1) = A x(k) + B u(k) + E p(k),    u = v - v0
-    y(k)   = C x(k) + D u(k) + H p(k) + y0
-    z(k)   = F x(k) + G u(k),             p = f(z): softening and plays
+The state x follows the voltages u about `v0`:
 
-Each signal z_j is a mixture of motion and voltage, such as the extension of an actuator.  The
-first `levels` signals soften: p_j = z_j (s - 1), where s is the rms of these signals with the time
-constant `memory`, 1 at the level of the fit.  The others are hysteretic: p_j is a sum of plays
-with few, shared thresholds.  p acts on the stage as one more voltage, so stiffness, damping and
-gain change with the motion.  With F = 0 the plays lie in front of the mechanics.
+    x(k+1) = A x(k) + B u(k) + E p(k)
+
+The displacements y about `y0` are
+
+    y(k) = C x(k) + D u(k) + H p(k)
+
+Signals z mix motion and voltage.  The extension of an actuator is an example.
+
+    z(k) = F x(k) + G u(k)
+
+Each signal z_j makes a push p_j.  The first `levels` signals soften:
+
+    p_j = z_j (s - 1)
+
+The level s is the rms of these signals, with the time constant `memory`.  It is 1 on average over
+the records of the fit.  The other signals are hysteretic.  Their p_j is a sum of plays, and all
+signals share a few thresholds.
+
+A push acts on the stage as one more voltage.  It changes stiffness, damping and gain with the
+motion.  With F = 0 the plays lie in front of the mechanics.
 """
 
 from __future__ import annotations
@@ -45,7 +58,7 @@ class SharedModes:
     linear : Modal
         A, B, C, D: the stage at the level s = 1 without its plays.
     e, h, f, g : ndarray, shapes (n, q), (outputs, q), (q, n), (q, inputs)
-        How the q signals push, and what they are.
+        Matrices of the q signals: e and h apply their pushes, f and g form them.
     levels : int
         Number of signals that soften; they come first.
     mu : ndarray, shape (q, thresholds)
@@ -206,7 +219,7 @@ def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
             'e': (n, q), 'h': (axes, q), 'f': (q, n), 'g': (q, axes), 'mu': (q, k), 'r': (k,),
             'v0': (axes,), 'y0': (axes,), 'range': (2,), 'levels': (), 'memory': (),
         }  # fmt: skip
-        # a list without rows does not tell how many columns it has
+        # a list without rows has lost its number of columns
         found = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
         sound = all(np.isfinite(x).all() for x in found.values()) and found['memory'] > 0
         levels, low, high = int(found['levels']), *map(float, found['range'])

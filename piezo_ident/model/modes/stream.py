@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.modes.kernels import LoopState
 from piezo_ident.model.modes.shared_modes import SharedModes
 
@@ -25,10 +25,13 @@ class ModesStream:
     Parameters
     ----------
     modes : SharedModes
+    side : {-1, 0, 1}, optional
+        Where the plays begin: at the lower or upper end of all that is possible at rest, or as
+        they are in a stage that comes from the middle voltage of the fit.
     """
 
-    def __init__(self, modes: SharedModes) -> None:
-        self.modes = modes
+    def __init__(self, modes: SharedModes, side: int = 0) -> None:
+        self.modes, self._side = modes, side
         self._state: LoopState | None = None
         self.forget()
 
@@ -57,14 +60,38 @@ class ModesStream:
             )
         u, y = v - modes.v0, np.empty((len(v), len(modes.y0)))
         if self._state is None and len(u):
-            self._state = LoopState.at_zero(modes.loop)
-            modes.run(np.repeat(u[:1], modes.settling, axis=0), self._state)
+            self._state = self._settled(np.repeat(u[:1], modes.settling, axis=0))
         for start in range(0, len(u), CHUNK):
             run = modes.run(u[start : start + CHUNK], self._state)
             y[start : start + CHUNK] = run.y + modes.y0
             self._low = np.minimum(self._low, run.z.min(axis=0))
             self._high = np.maximum(self._high, run.z.max(axis=0))
         return y
+
+    def _settled(self, rest: Array) -> LoopState:
+        """Settle under voltages of rest about those of the fit."""
+        modes, state = self.modes, LoopState.at_zero(self.modes.loop)
+        run = modes.run(rest, state)
+        if self._side:
+            state.memory[:] = run.z[-1][:, None] + self._side * modes.r
+            # other plays move the modes
+            modes.run(rest, state)
+        return state
+
+
+class MemorySpread:
+    """Largest change of a displacement by plays whose outputs at the beginning are unknown."""
+
+    def __init__(self, modes: SharedModes) -> None:
+        self._sides = [ModesStream(modes, side) for side in (-1, 1)]
+
+    def follow(self, v: Array, y: Array) -> Array:
+        """Compute it for voltages [V] and the displacements of a run [m], shapes (n, k)."""
+        try:
+            ends = [side.process(v) - y for side in self._sides]
+        except ModelError:  # ran away
+            return np.full(y.shape, np.inf)
+        return np.asarray(np.max(np.abs(ends), axis=0))
 
 
 class Past(Protocol):
@@ -85,6 +112,8 @@ class ModesRun:
     modes : SharedModes
     axes : sequence of str
         Order of the rows, by the names of the displacements.
+    doubts : bool, optional
+        Whether to follow the effect of unknown plays.
 
     Attributes
     ----------
@@ -92,15 +121,23 @@ class ModesRun:
     is_partial : bool
         Whether the run lacks older voltages, on which its plays may depend.
     felt : ndarray, shape (k, n)
-        Zero: no part of a displacement is that of another axis alone.
+        Zero: shared modes do not tell the parts of the axes apart.
+    spread : ndarray, shape (k, n)
+        Largest effect of unknown plays on the last displacements [m]; zero without `doubts`.
     """
 
-    def __init__(self, modes: SharedModes, axes: Sequence[str]) -> None:
-        self.stream = ModesStream(modes)
+    def __init__(self, modes: SharedModes, axes: Sequence[str], *, doubts: bool = False) -> None:
+        self.stream, self._doubts = ModesStream(modes), doubts
+        self._memory = MemorySpread(modes) if doubts else None
         self._order = np.argsort(axes)
         self._rows = np.argsort(self._order)
         self.is_partial = False
-        self.felt = np.zeros((len(axes), 0))
+        self.felt = self.spread = np.zeros((len(axes), 0))
+
+    def forget(self) -> None:
+        """Take the outputs of the plays as unknown from now on."""
+        self.stream.forget()
+        self._memory = MemorySpread(self.stream.modes) if self._doubts else None
 
     def recall(self, pasts: Sequence[Past], period: float) -> None:
         """Run through the voltages that `pasts` still keep, one past a row."""
@@ -110,5 +147,9 @@ class ModesRun:
 
     def process(self, v: Array, t: Array | None = None) -> Array:
         """Compute the next displacements [m] of voltages [V], shapes (k, n); t is not used."""
-        self.felt = np.zeros(v.shape)
-        return np.ascontiguousarray(self.stream.process(v[self._order].T).T[self._rows])
+        self.felt = self.spread = np.zeros(v.shape)
+        columns = v[self._order].T
+        y = self.stream.process(columns)
+        if self._memory is not None:
+            self.spread = self._memory.follow(columns, y).T[self._rows]
+        return np.ascontiguousarray(y.T[self._rows])

@@ -9,7 +9,11 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.model.modes.stream import ModesStream
+from piezo_ident.model.multi_axis import SHARED_MODES
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.record import Piece
+from piezo_ident.uncertainty.band import KEY, PredictionBand
+from piezo_ident.verbs.predict import bands
 import pytest
 from random_models import random_modes_model, random_voltages
 
@@ -97,6 +101,28 @@ def test_a_gap_is_bridged_and_the_memory_is_unknown_until_the_next_sweep():
     assert predictor.lost == 49 and predictor.memory_known
     whole = np.delete(offline(model, v, AXES[:2]), np.s_[2001:2050], axis=1)
     np.testing.assert_allclose(np.hstack(made), whole, rtol=0.0, atol=1e-12 * np.ptp(whole))
+
+
+def test_the_live_band_is_the_offline_one():
+    model, v = case(12)
+    band = PredictionBand(np.array([1e-3, 1e-2, 1e-6, 1e-2]), np.array([0.8, 1.2, 1.5]), 1e6)
+    own = {SHARED_MODES: {KEY: band.to_dict()}, KEY: 'of the chain'}
+    axes = {a: replace(x, identification=own) for a, x in model.axes.items()}
+    # the order of the node is not that of the file
+    model, order = pi.MultiAxisModel(axes, model.modes), AXES[1::-1]
+    predictor, halves = Predictor(order, 0.8), []
+    predictor.set_model(model)
+    for k in range(0, 3000, 100):
+        predictor.process(Samples((k + np.arange(100)) / RATE, v[:, k : k + 100]))
+        halves.append(predictor.half_width.values)
+    columns = {f'v{a[1:]}': row for a, row in zip(order, v, strict=True)}
+    piece = Piece(columns.pop('v'), np.full(3000, np.nan), RATE, channels=columns)
+    record = pi.Record((piece,), 'voltages')
+    offline_bands = bands(model, record, model.predicted(record), 0.8)
+    for row, axis in zip(np.hstack(halves), order, strict=True):
+        np.testing.assert_array_equal(row, offline_bands[axis][0])
+    with pytest.raises(pi.ModelError, match='no prediction band'):
+        bands(case(12)[0], record, model.predicted(record), 0.8)
 
 
 def test_modes_that_run_away_are_a_problem_of_the_stream():
