@@ -7,12 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.live.corrector import Corrector
+from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.predictor import Predictor
+from piezo_ident.live.tracker import prepared
 from piezo_ident.model.modes.stream import ModesStream
-from piezo_ident.model.multi_axis import SHARED_MODES
+from piezo_ident.model.multi_axis import alone, SHARED_MODES
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import KEY, PredictionBand
+from piezo_ident.verbs.invert import learn_axes
 from piezo_ident.verbs.predict import bands
 import pytest
 from random_models import random_modes_model, random_voltages
@@ -138,3 +142,42 @@ def test_modes_that_run_away_are_a_problem_of_the_stream():
 def test_shared_modes_of_other_axes_are_refused():
     with pytest.raises(pi.ModelError, match="'axes'"):
         Predictor(('y', 'y_c')).set_model(case(11)[0])
+
+
+def test_the_observer_corrects_the_prediction_of_each_axis():
+    model, v = case(13, n=20_000)
+    # as a diagnosis writes them, in % of span
+    known = {SHARED_MODES: {'diagnosis': {'errors': {'after': 0.01, 'worst': 0.01}}}}
+    axes = {a: replace(x, identification=known) for a, x in model.axes.items()}
+    model = pi.MultiAxisModel(axes, model.modes)
+    predictor = Predictor(AXES[:2])
+    predictor.set_model(model)
+    y, moved = offline(model, v, AXES[:2]), np.array([[4e-7], [-3e-7]])
+    correctors, got = [Corrector(), Corrector()], [[], []]
+    for k, axis in enumerate(AXES[:2]):
+        correctors[k].set_model(alone(model)[axis])
+    for cut in (slice(i, i + 100) for i in range(0, v.shape[1], 100)):
+        t = np.arange(v.shape[1])[cut] / RATE
+        predicted_rows = predictor.process(Samples(t, v[:, cut])).values
+        for k, one in enumerate(correctors):
+            prediction, voltage = Samples(t, predicted_rows[k]), Samples(t, v[k, cut])
+            got[k] += one.predicted(prediction, voltage, True, predictor.felt[k])
+            got[k] += one.measured(t, (y + moved)[k, cut])
+    for k in range(2):
+        estimate = np.concatenate([one.samples.values for one in got[k]])
+        left = (estimate - (y + moved)[k, : estimate.size])[estimate.size // 2 :]
+        assert np.abs(left).max() < 0.1 * abs(moved[k, 0])
+
+
+def test_what_runs_chains_alone_refuses_shared_modes():
+    model, v = case(14)
+    record = pi.Record((Piece(v[0], v[0], RATE, channels={'v_b': v[1], 'y_b': v[1]}),), 'both')
+    settings = GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
+    for verb, act in {
+        'feedforward': lambda: prepared(model, AXES[:2], settings, 0, 'off', None),
+        'learn': lambda: learn_axes(model, {a: np.zeros(9) for a in AXES[:2]}),
+        'diagnose': lambda: pi.diagnose(model, record),
+    }.items():
+        with pytest.raises(pi.ModelError, match=f'^{verb}: cannot run the modes') as caught:
+            act()
+        assert 'MultiAxisModel(model.axes)' in str(caught.value)

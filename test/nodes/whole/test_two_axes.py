@@ -103,6 +103,8 @@ def test_the_live_prediction_is_the_free_run(lab, identified, shares_modes):
         model.save(path)
         assert lab.set('model', 'model', str(path))[0]
         lab.wait(lambda: path.name in lab.status('model')['text'], 'the model with shared modes')
+        ok, reason = lab.set('model', 'adapt', 'gain')
+        assert not ok and 'adapt: cannot run the modes' in reason
     lab.wait(lambda: lab.status('model')['state'] == 'predicting', 'a model')
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
     # of the paths there are none yet; the last figures of a path are of the test of `AxesRun`
