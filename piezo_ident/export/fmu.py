@@ -15,13 +15,17 @@ import uuid
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from piezo_ident import __version__
+from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.export.header import c_number, export_c, plain_text, render
 from piezo_ident.export.links import LinkGroup, links_of
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
 
-def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'stage') -> None:
+def export_fmu(
+    model: StageModel | MultiAxisModel, path: str | os.PathLike[str], name: str = 'stage'
+) -> None:
     """
     Write a model as an FMU in source: FMI 3.0, co-simulation.
 
@@ -40,7 +44,7 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
     ConfigError
         If the name is not an identifier in C.
     ModelError
-        If an effect of the model has no C code.
+        If an effect of the model has no C code, or the model has several axes.
     DataError
         If the file cannot be written.
 
@@ -49,6 +53,8 @@ def export_fmu(model: StageModel, path: str | os.PathLike[str], name: str = 'sta
     >>> import piezo_ident as pi
     >>> pi.export_fmu(pi.SimulatedStage.load('paper').model, 'stage.fmu')
     """
+    if isinstance(model, MultiAxisModel):
+        raise ModelError('export: the model has several axes, and an FMU holds one; use export_c')
     header = export_c(model, name, feedforward=False)
     links = [link for part in links_of(model) for link in part.links]
     values = {
