@@ -3,9 +3,8 @@
 
 """Noise floor, lines, dependence and faults of the data in the residual of a model."""
 
-from piezo_ident.residual.analysis import analyse, ResidualAnalysis
+from piezo_ident.residual.analysis import analyse, Curve, ResidualAnalysis
 from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest, without_channels
-from piezo_ident.residual.dependence import Curve
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.lines import find_lines, LineSearch, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data that a model shows: jitter, outliers, clipping, coarse steps, knocks."""
+"""Faults of the data that a model shows: jitter, outliers, clipping, coarse steps."""
 
 from __future__ import annotations
 
@@ -24,11 +24,8 @@ from piezo_ident.record.readings.faults import (
 from piezo_ident.record.readings.jumps import FAR
 from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
-from piezo_ident.residual.transients import transients_in
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-#: least size of a knock, as a share of the stroke; most times of knocks in a message
-KNOCK, MOST_TIMES = 1e-4, 8
 #: least quantum of a fault, in multiples of the other noise and as a share of the stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
 #: the surroundings of an outlier show at most this share of it
@@ -54,7 +51,7 @@ class FaultSearch:
 
 def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
     """
-    Look for outliers, clipping, coarse steps, jitter and knocks: one fault for each part and kind.
+    Look for outliers, clipping, coarse steps and jitter: one fault for each part and kind.
 
     `piezo_ident.record.readings.faults` has left out the faults that the readings alone show.
     """
@@ -77,7 +74,6 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             many = float(outliers.mean()) > MAX_WILD
             faults += _masked(part, outliers, clipped, many)
             faults += _of_all(part, stroke, noise, jitter, growth)
-            faults += _knocks(part, stroke, noise, outliers | clipped)
             bad = clipped if many else outliers | clipped
         found.append(bad)
     return FaultSearch(tuple(faults), tuple(found), quantum)
@@ -116,20 +112,6 @@ def _of_all(
         )
         faults.append(Fault('timing_jitter', where, n, what))
     return faults
-
-
-def _knocks(part: ResidualPart, stroke: float, noise: _Noise, known: Mask) -> list[Fault]:
-    # a code that is left for a moment is no knock
-    found = transients_in(part, known, max(KNOCK * stroke, 1.5 * noise.quantum))
-    if not found.times:
-        return []
-    times = ', '.join(f'{t:.4g}' for t in found.times[:MOST_TIMES])
-    more = ', ...' if len(found.times) > MOST_TIMES else ''
-    what = (
-        f'transients of up to {percent(found.size, stroke):.2g} % of the stroke, '
-        f'{1e3 * found.length:.2g} ms long, at times that the drive does not set: knocks; left in'
-    )
-    return [Fault('outliers', f'in {part.record}, at {times}{more} s', len(found.times), what)]
 
 
 class _Noise(NamedTuple):

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.residual.beyond_drive import without_drive
-from piezo_ident.residual.reversals import TURN, turns_of
 from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
 from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
@@ -30,6 +29,8 @@ LOCKED, ROUNDING = 16.0, 1e-12
 FAINT = 0.15
 #: worth of a median of exponential variables, as a share of a mean, as an estimate of their scale
 MEDIAN_WORTH = 0.48
+#: share of the range from which a change of direction counts: noise turns all the time
+TURN = 0.01
 #: further points of the grid on either side under a spline of the transform
 WIDER = 6
 
@@ -152,6 +153,32 @@ def _motions(
         driven = _driven(v[a:b], series.x, series.window)
         found.append(replace(series, driven=driven, locked=_locked(v[a:b])))
     return found
+
+
+def turns_of(v: Array, least: float) -> Integers:
+    """
+    Find the indices at which a voltage turns and then moves by `least` [V] the other way.
+
+    >>> turns_of(np.array([0.0, 5.0, 4.9, 6.0, 1.0, 2.0]), 0.5)
+    array([3, 4])
+    """
+    found: list[int] = []
+    low = high = 0
+    up: bool | None = None
+    for i, x in enumerate(v.tolist()):
+        if x > v[high]:
+            high = i
+        if x < v[low]:
+            low = i
+        if up is not False and x < v[high] - least:
+            if up:
+                found.append(high)
+            up, low = False, i
+        elif up is not True and x > v[low] + least:
+            if up is False:
+                found.append(low)
+            up, high = True, i
+    return np.array(found, dtype=np.int64)
 
 
 def _locked(v: Array) -> Mask:

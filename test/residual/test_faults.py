@@ -89,22 +89,6 @@ def test_a_wrong_mode_is_no_jitter(truth):
     assert faults(v, y + ringing + 1.5e-9 * rng.standard_normal(y.size), y)[0] == {}
 
 
-def test_knocks_in_rests_and_repeats_are_transients(truth):
-    v, y, read = truth
-    rng = np.random.default_rng(5)
-    t = np.arange(4000) / RATE
-    knock = 0.06e-2 * 75e-6 * np.exp(-t / 0.015) * np.sin(2 * np.pi * 500 * t)
-    z = read.copy()
-    for start in rng.choice(y.size - t.size, 25, replace=False):
-        z[start : start + t.size] += rng.choice([-1, 1]) * knock
-    # under a model that is wrong by two per cent
-    named, found = faults(v, z, 0.98 * y)
-    assert set(named) == {'outliers'}
-    assert 'knocks' in named['outliers'].action
-    assert 5 <= named['outliers'].count <= 26
-    assert not found.bad[0].any()
-
-
 @pytest.mark.parametrize('jitter', [1e-6, 5e-6])
 def test_timing_jitter(truth, jitter):
     v, y, read = truth

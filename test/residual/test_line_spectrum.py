@@ -5,7 +5,7 @@
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.residual.reversals import turns_of
+from piezo_ident.residual.line_spectrum import turns_of
 import pytest
 
 RATE = 1000.0
