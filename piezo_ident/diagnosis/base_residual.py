@@ -10,23 +10,24 @@ remaining residual gives lines and the noise floor, and thereby the error to exp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.diagnosis.candidates import Known
+from piezo_ident.diagnosis.criteria import IN_PROPORTION
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted
 from piezo_ident.diagnosis.refits import refits
 from piezo_ident.diagnosis.rows import centred, make_rows, means
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import CREEP, State
-from piezo_ident.diagnosis.verdict import missed_now
 from piezo_ident.identification.prepare import filled_in
+from piezo_ident.identification.spectra import high_passed
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.record.record import Record
+from piezo_ident.record.record import Fault, Record
 from piezo_ident.residual import (
     all_stretches,
     channel_tests,
@@ -70,19 +71,34 @@ def prepared(model: StageModel, records: Sequence[Record]) -> tuple[Simulator, F
 @dataclass(frozen=True, eq=False)
 class BaseResidual:
     """
-    The model with another H, and what its residual shows.
+    The model with another H, and the findings in its residual.
 
-    `plays` and `wide` are H refitted as plays and as the better of the wide laws.  `single` is the
-    mean square of the noise of single samples, or None.
+    Attributes
+    ----------
+    given : State
+        The model as given, with its own offset in each record.
+    plays, wide : Fitted
+        H refitted as plays, and as the better of the wide laws.
+    channels, lines, floor
+        Tests of further channels, search for lines, and noise floor.
+    noise, single : float
+        Mean squares of the noise of a row, and of single samples (None if unknown).
+    missed : float
+        Possible error of G on this motion, rms in % of stroke.
+    faults : tuple of Fault
+        Faults of the data that the model as given shows.
     """
 
-    known: Known
+    given: State
     plays: Fitted
     wide: Fitted
     channels: tuple[ChannelTest, ...]
     lines: LineSearch
     floor: NoiseFloor
+    noise: float
     single: float | None
+    missed: float
+    faults: tuple[Fault, ...]
 
     @property
     def significant(self) -> list[str]:
@@ -99,27 +115,27 @@ class BaseResidual:
         return found | ({'cross_coupling'} if any(test.tells for test in self.channels) else set())
 
 
-def base_residual(simulator: Simulator, quantum: float) -> BaseResidual:
+def base_residual(simulator: Simulator, faults: FaultSearch) -> BaseResidual:
     """Refit H, and find lines and noise of the residual."""
     model, rows = simulator.model, simulator.rows
     given = State(model.hysteresis, np.zeros(len(rows.names)))
     # each record has its own offset, as the sensor may have been zeroed again
     given = replace(given, offsets=means(rows.x - simulator.run(given), rows.of_record))
     if any(setting.name == CREEP for setting in model.effects):
-        as_given = fit_jointly(simulator, given, base_at(simulator, given))
-        given = with_earlier_motion(simulator, as_given).state
+        given = with_earlier_motion(simulator, fit_jointly(simulator, given)).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
-    noise, single = floor.squares(quantum, rows.m, abs(model.scaling.Y))
+    noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
     # while a memory settles, periods differ by more than the noise, and the estimated noise is too
     # large; no model errs by less than the noise, so the smallest error bounds it
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
     single = None if single is None else single - excess
-    frequencies = tuple(line.frequency for line in lines.lines)
-    known = Known(given, frequencies, noise - excess, missed_now(simulator))
-    return BaseResidual(known, plays, wide, channels, lines, floor, single)
+    missed, noise = missed_now(simulator), noise - excess
+    return BaseResidual(
+        given, plays, wide, channels, lines, floor, noise, single, missed, faults.faults
+    )
 
 
 def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[ResidualPart]:
@@ -165,3 +181,35 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
     # the voltage moves, as checked above, so small motion counts here, too
     if runs_against(((rows.x[own], known[own]) for own in of_each), 0.0, AGAINST):
         raise IdentificationError(f'{names}: {REVERSED}')
+
+
+def missed_then(model: StageModel) -> float:
+    """Return the error on fast motion at the identification [% of stroke]; 0 if unknown."""
+    known = _entries(model, 'errors')
+    if 'fast_motion' in known:
+        known = {'fast_motion': known['fast_motion']}
+    # a file without this entry holds the error on all motion
+    return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
+
+
+def missed_now(simulator: Simulator) -> float:
+    """
+    Estimate the error of G on the motion in these data, % of stroke.
+
+    The error of G grows with fast motion.  Part of the known error does not belong to G, such as
+    small loops that open less than H predicts.  Only the share `IN_PROPORTION` of the proportional
+    growth therefore counts.
+    """
+    model = simulator.model
+    then = _entries(model, 'fast_displacement').get('percent_of_stroke')
+    missed = missed_then(model)
+    if not isinstance(then, int | float) or not then > 0.0:
+        return missed
+    fast = [high_passed(run.x, run.piece.sample_rate)[run.use] for run in simulator.rows.runs]
+    now = 100.0 * float(np.sqrt(np.mean(np.concatenate(fast) ** 2)))
+    return missed * max(1.0, IN_PROPORTION * now / float(then))
+
+
+def _entries(model: StageModel, name: str) -> Mapping[str, Any]:
+    found = model.identification.get(name)
+    return found if isinstance(found, Mapping) else {}

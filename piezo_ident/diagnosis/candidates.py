@@ -14,19 +14,17 @@ therefore tried beside the H as given, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from piezo_ident.common.errors import ModelError
+from piezo_ident.diagnosis.base_residual import BaseResidual
 from piezo_ident.diagnosis.criteria import ALIKE, LITTLE, RIVALS, SMALLEST_EFFECT, TAKES
 from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
-from piezo_ident.diagnosis.joint_fit import base_at, fit_jointly, Fitted
+from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, tried
 from piezo_ident.diagnosis.refits import law_of, refit_of, with_g
 from piezo_ident.diagnosis.search import Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import TrialColumns
 from piezo_ident.effects import Effect, find_effect
 
@@ -40,41 +38,18 @@ IN_ALL_WAYS = 3
 Tick = Callable[[float], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Known:
-    """
-    What is known before the search.
-
-    Attributes
-    ----------
-    given : State
-        State of the model as given.
-    lines : tuple of float
-        Frequencies of lines in the residual [Hz].
-    noise : float
-        Mean square of the noise of a row.
-    missed : float
-        Possible error of G, see `Candidates.missed`.
-    """
-
-    given: State
-    lines: tuple[float, ...]
-    noise: float
-    missed: float
-
-
 class CandidateSearch:
     """Search that fits the candidates of some data; `effects` names those that may be added."""
 
     def __init__(
         self,
         simulator: Simulator,
-        known: Known,
+        residual: BaseResidual,
         effects: Sequence[str],
         rng: np.random.Generator,
         tick: Tick,
     ) -> None:
-        self._simulator, self._known, self._rng, self._tick = simulator, known, rng, tick
+        self._simulator, self._residual, self._rng, self._tick = simulator, residual, rng, tick
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
         # a change of a known effect of the path would look like another such effect
@@ -87,13 +62,14 @@ class CandidateSearch:
         #: all searches so far
         self.rounds: list[Round] = []
 
-    def shown(self, fitted: Fitted, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
+    def shown(self, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
         """
         Add each effect that a test of its own has shown; return the fit and the added names.
 
         Each such effect must lower the mean square by at least `SMALLEST_EFFECT`, beside the
         effects added before it.
         """
+        fitted = self._residual.wide
         least = self._simulator.rows.square(SMALLEST_EFFECT)
         found = list[str]()
         for name in names:
@@ -103,9 +79,9 @@ class CandidateSearch:
                 found.append(name)
         return fitted, tuple(found)
 
-    def of(self, plays: Fitted, wide: Fitted, most: int) -> Candidates:
-        """Fit all candidates with up to `most` effects beside the effects of two refits."""
-        candidates = self._ways(plays, wide)
+    def of(self, wide: Fitted, most: int) -> Candidates:
+        """Fit all candidates with up to `most` effects beside the effects of a wide refit."""
+        candidates = self._ways(wide)
         least = min(map(candidates.left, candidates.all))
         path = [effect for effect in self._effects if effect.rate_independent]
         best = _best_h(candidates)
@@ -135,45 +111,49 @@ class CandidateSearch:
         sum of plays may leave an error that another effect fits by accident.
         """
         sets = [s for s in candidates.sets if len(s) == size]
-        laws = {c.way: law_of(c.fitted) for c in candidates.of(()) if c.way != 'given'}
         for effects in sets[:IN_ALL_WAYS]:
             best = candidates.of(effects)[0]
-            have = {c.way for c in candidates.of(effects)}
-            state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
             # a treatment with a larger error than the best treatment does not count
-            goal = np.inf if effects == sets[0] else self._known.noise + candidates.left(best)
-            more = []
-            # an effect that runs away beside one H may hold beside another
-            with suppress(ModelError):
-                if 'given' not in have:
-                    fitted = fit_jointly(self._simulator, state, base_at(self._simulator, state))
-                    fitted = with_earlier_motion(self._simulator, fitted)
-                    state = fitted.state
-                    more.append(replace(best, way='given', fitted=fitted))
-            for way, law in laws.items():
-                with suppress(ModelError):
-                    if way not in have:
-                        fitted = refit_of(self._simulator, state, law, goal)
-                        more.append(replace(best, way=way, fitted=fitted))
-            with suppress(ModelError):
-                last = min(more, key=candidates.left, default=best)
-                if self._simulator.is_fast and not (change_g(effects) or last.retunes):
-                    more.append(replace(last, fitted=with_g(self._simulator, last.fitted, goal)))
-            candidates = candidates.and_these(more)
+            goal = np.inf if effects == sets[0] else self._residual.noise + candidates.left(best)
+            candidates = candidates.and_these(self._other_ways(candidates, best, goal))
         return candidates
 
-    def _ways(self, plays: Fitted, wide: Fitted) -> Candidates:
-        """Fit the candidates without an effect, except for the effects of the refits."""
-        simulator = self._simulator
-        state = replace(self._known.given, effects=wide.state.effects)
-        given = fit_jointly(simulator, state, base_at(simulator, state))
+    def _other_ways(self, candidates: Candidates, best: Candidate, goal: float) -> list[Candidate]:
+        """Fit the set of a candidate with all other treatments of H, and then with a retuned G."""
+        simulator, have = self._simulator, {c.way for c in candidates.of(best.effects)}
+        state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
+        found = dict[str, Fitted | None]()
+        if 'given' not in have:
+            given = tried(fit_jointly, simulator, state)
+            if given is not None:
+                given = with_earlier_motion(simulator, given)
+                state = given.state
+            found['given'] = given
+        for c in candidates.of(()):
+            if c.way not in {'given', *have, *found}:
+                found[c.way] = tried(refit_of, simulator, state, law_of(c.fitted), goal)
+        # an effect that runs away beside one H may hold beside another
+        more = [replace(best, way=way, fitted=one) for way, one in found.items() if one]
+        last = min(more, key=candidates.left, default=best)
+        if simulator.is_fast and not (change_g(best.effects) or last.retunes):
+            retuned = tried(with_g, simulator, last.fitted, goal)
+            more += [replace(last, fitted=retuned)] if retuned else []
+        return more
+
+    def _ways(self, wide: Fitted) -> Candidates:
+        """Fit the candidates without an effect, except for the effects of the wide refit."""
+        simulator, plays = self._simulator, self._residual.plays
+        state = replace(self._residual.given, effects=wide.state.effects)
+        given = fit_jointly(simulator, state)
         if plays.state.effects != wide.state.effects:
             plays = refit_of(simulator, state, 'plays')
         named = {'given': given, 'plays': plays, 'wide': wide}
         found = [Candidate((), way, fitted) for way, fitted in named.items()]
         if simulator.is_fast:
             found += [replace(found[i], fitted=with_g(simulator, found[i].fitted)) for i in (0, 2)]
-        return Candidates(simulator.rows, self._known.noise, self._known.missed, tuple(found))
+        return Candidates(
+            simulator.rows, self._residual.noise, self._residual.missed, tuple(found)
+        )
 
     def _with_each(
         self, base: Candidate, some: Sequence[type[Effect]], goal: float
@@ -218,14 +198,15 @@ class CandidateSearch:
             # most searches end after three or four rounds, so the bar slows down towards its end
             self._tick(1.0 - 0.6 ** (done + share))
 
+        lines = [line.frequency for line in self._residual.lines.lines]
         return search_round(
-            TrialColumns(self._simulator, fitted.state, self._known.lines),
+            TrialColumns(self._simulator, fitted.state, lines),
             fitted,
             effects,
-            self._known.noise,
+            self._residual.noise,
             self._rng,
             tick,
-            goal=self._known.noise + goal,
+            goal=self._residual.noise + goal,
         )
 
 

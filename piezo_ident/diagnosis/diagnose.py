@@ -17,12 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis.base_residual import base_residual, BaseResidual, prepared
 from piezo_ident.diagnosis.candidates import CandidateSearch
 from piezo_ident.diagnosis.decision import Candidates, decide
+from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.messages import (
     left_over,
     part_judged,
@@ -32,11 +34,7 @@ from piezo_ident.diagnosis.messages import (
 )
 from piezo_ident.diagnosis.refined_model import found_effects, refine, Refined
 from piezo_ident.diagnosis.refits import law_of, Step, walk, with_numerator
-from piezo_ident.diagnosis.results import (
-    Diagnosis,
-    DiagnosisSettings,
-    Residual,
-)
+from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings, Errors, Residual
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State, TESTED
@@ -147,38 +145,33 @@ def _diagnosed(
     settings: DiagnosisSettings,
     progress: Progress,
 ) -> Diagnosis:
+    """Diagnose sound records; the result holds no sentence yet."""
     progress('residual', 0.0)
     simulator, faults = prepared(model, records)
     progress('residual', 0.5)
-    residual = base_residual(simulator, faults.quantum)
+    residual = base_residual(simulator, faults)
     progress('residual', 1.0)
     have = {setting.name for setting in model.effects}
     names = [n for n in settings.effects or catalogue() if n not in {*settings.without, *have}]
     search = CandidateSearch(
         simulator,
-        residual.known,
+        residual,
         [name for name in names if name not in TESTED],
         np.random.default_rng(settings.seed),
         lambda share: progress('candidates', share),
     )
-    own_tests = [name for name in residual.significant if name in names]
-    base, shown = search.shown(residual.wide, own_tests)
-    candidates = search.of(residual.plays, base, settings.most_effects - len(shown))
+    base, shown = search.shown([name for name in residual.significant if name in names])
+    candidates = search.of(base, settings.most_effects - len(shown))
     progress('candidates', 1.0)
     decision = decide(candidates)
-    last = walk(
-        simulator,
-        residual.known.given,
-        candidates,
-        decision.best,
-        lambda: progress('verdict', 0.5),
-    )
+    tick = partial(progress, 'verdict', 0.5)
+    last = walk(simulator, residual.given, candidates, decision.best, tick)
     last = with_numerator(simulator, last)
     untried = set(catalogue()) - set(names) - have
     findings = judge(candidates, decision, last, shown, residual.wide.mean_square, untried)
     result = _result(simulator, residual, search.rounds, candidates, findings, last, settings)
     progress('verdict', 1.0)
-    return replace(result, faults=faults.faults, set_in=decision.set_in)
+    return result
 
 
 # -- the result ----------------------------------------------------------------------------------
@@ -193,29 +186,17 @@ def _result(
     last: Step,
     settings: DiagnosisSettings,
 ) -> Diagnosis:
-    """Report the findings, without the faults of the data and without a sentence."""
-    model, rows, given = simulator.model, simulator.rows, residual.known.given
-    single = residual.single
-    # noise of single samples that the averaging to rows removes
-    lost = 0.0 if single is None else max(single - residual.known.noise, 0.0)
+    """Report the findings, without a sentence."""
+    model, rows = simulator.model, simulator.rows
     # an effect that its own test has shown is beside all candidates
     best = candidates.without().fitted
     without = residual.wide if best.state.effects else best
-    before, refit, held_out, after = (
-        rows.errors(e, lost)
-        for e in (
-            rows.x - simulator.run(given),
-            without.held_out_residual(rows),
-            last.fitted.held_out_residual(rows),
-            last.fitted.held_out_residual(rows, rows.group),
-        )
-    )
-    refined = refine(simulator, given, last, findings, (before, after))
+    before, refit, held_out, after = _errors(simulator, residual, without, last.fitted)
+    refined = refine(simulator, residual.given, last, findings, (before, after))
     if refined.is_given:
         held_out = after = before
     smallest = smallest_detectable(candidates, findings)
     tested = residual.tested | {*settings.without, *(one.name for one in model.effects)}
-    crept = rows.percent(float(np.max(simulator.crept(refined.state) ** 2)))
     return Diagnosis(
         verdict=findings.verdict,
         sentence='',
@@ -228,17 +209,17 @@ def _result(
         before=before,
         refit=refit,
         after=after,
-        noise_floor=None if single is None else rows.percent(single),
+        noise_floor=None if residual.single is None else rows.percent(residual.single),
         noise_source=residual.floor.source,
         smallest_detectable=smallest,
         untestable=untestable_of(rounds, settings, tested),
-        faults=(),
-        residuals=_residuals(simulator, given, without.state, refined),
+        faults=residual.faults,
+        residuals=_residuals(simulator, residual.given, without.state, refined),
         records=rows.names,
         blocks=int(rows.fold.size),
         warnings=(
             *part_judged(rows),
-            *warnings_of(model, refined, residual.floor, crept),
+            *warnings_of(simulator, refined, residual.floor),
             *(warning for one in rounds for warning in one.warnings),
         ),
         settings=settings,
@@ -246,23 +227,40 @@ def _result(
         errors_of_laws=errors_of_laws(candidates),
         kinds=rows.kinds,
         gain=findings.gain,
+        set_in=findings.set_in,
         held_out=held_out,
         errors_of_sets=errors_of_sets(candidates),
     )
 
 
+def _errors(
+    simulator: Simulator, residual: BaseResidual, without: Fitted, last: Fitted
+) -> list[Errors]:
+    """Compute the errors as given, refitted, refined on held-out blocks, and on other motion."""
+    rows, single = simulator.rows, residual.single
+    # noise of single samples that the averaging to rows removes
+    lost = 0.0 if single is None else max(single - residual.noise, 0.0)
+    parts = (
+        rows.x - simulator.run(residual.given),
+        without.held_out_residual(rows),
+        last.held_out_residual(rows),
+        last.held_out_residual(rows, rows.group),
+    )
+    return [rows.errors(e, lost) for e in parts]
+
+
 def _residuals(
     simulator: Simulator, given: State, without: State, refined: Refined
 ) -> tuple[Residual, ...]:
-    Y = simulator.model.scaling.Y
+    """Compute the residuals of each piece as given, before, and after the refinement [m]."""
+    runs, Y = simulator.rows.runs, simulator.model.scaling.Y
     # a refit without effects has no model between the given and the refined one
     is_refit = not refined.is_given and not refined.state.effects
     before = refined.state if is_refit else without
-    full = [simulator.full(s) for s in (given, before, refined.state)]
-    residuals = []
-    for i, run in enumerate(simulator.rows.runs):
-        as_given, between, after = ((run.x - x[i]) * Y for x in full)
-        residuals.append(
-            Residual(run.record, run.piece, as_given, between, after, sound=run.known)
+    full = [simulator.full(state) for state in (given, before, refined.state)]
+    return tuple(
+        Residual(
+            run.record, run.piece, Y * (run.x - a), Y * (run.x - b), Y * (run.x - c), run.known
         )
-    return tuple(residuals)
+        for run, a, b, c in zip(runs, *full, strict=True)
+    )

@@ -16,19 +16,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.equations import (
     held_out_errors,
     normal_equations,
     with_columns,
 )
-from piezo_ident.diagnosis.joint_fit import (
-    base_at,
-    fit_jointly,
-    Fitted,
-    with_fresh_columns,
-)
+from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, POLISH, POLISHING, tried
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import cost_of_decays, CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
@@ -56,14 +50,12 @@ def with_earlier_motion(
     start = replace(state, fading=times, earlier=none)
     if not _may_help(simulator, fitted, start):
         return fitted
-    try:
-        fitted = _settled(simulator, state, tick)
-        crept = _settled(simulator, start, tick)
-    except IdentificationError:
-        # the fit fails, so the data do not hold this creep
+    rested, crept = (tried(_settled, simulator, one, tick) for one in (state, start))
+    if rested is None or crept is None:
+        # a fit fails, so the data do not hold this creep
         return fitted
-    is_better = crept.mean_square <= EARLIER_LEAVES**2 * fitted.mean_square
-    return crept if is_better and _is_possible(simulator, crept.state) else fitted
+    is_better = crept.mean_square <= EARLIER_LEAVES**2 * rested.mean_square
+    return crept if is_better and _is_possible(simulator, crept.state) else rested
 
 
 def _may_help(simulator: Simulator, fitted: Fitted, start: State) -> bool:
@@ -102,6 +94,11 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
 
 
 def _settled(simulator: Simulator, state: State, tick: Callable[[], None]) -> Fitted:
-    """Fit a state until fresh columns of H gain nothing more."""
-    fitted = fit_jointly(simulator, state, base_at(simulator, state), tick=tick)
-    return with_fresh_columns(simulator, fitted, tick)
+    """Fit a state, again and again with fresh columns of H, as long as the error falls."""
+    fitted = fit_jointly(simulator, state, tick=tick)
+    for _ in range(POLISHING):
+        fresh = fit_jointly(simulator, fitted.state, tick=tick)
+        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted

@@ -12,11 +12,13 @@ candidate.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import ParamSpec
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.equations import (
     BaseColumns,
@@ -49,7 +51,10 @@ from piezo_ident.diagnosis.state import (
 )
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-ITERATIONS, ATTEMPTS, TOLERANCE = 20, 6, 1e-3
+P = ParamSpec('P')
+
+#: attempts of a step with more damping, and smallest gain of a step, as a share of the loss
+ATTEMPTS, TOLERANCE = 6, 1e-3
 #: first damping, as a share of the energy of each column, and smallest damping
 DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 #: consecutive steps that gain too little of their predicted gain, after which the columns of H are
@@ -59,6 +64,21 @@ POOR = 2
 LEAST_RATIO = 0.5
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Until:
+    """
+    The end of a fit.
+
+    A fit ends after some iterations, and after a step that lowers the mean square by less than
+    `enough`.  It also ends if the remaining steps, with equal or falling gains, would not reach
+    the mean square `goal` of the fitted rows.
+    """
+
+    iterations: int = 20
+    enough: float = 0.0
+    goal: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,58 +187,57 @@ def base_at(simulator: Simulator, state: State) -> BaseColumns:
 def fit_jointly(
     simulator: Simulator,
     state: State,
-    base: BaseColumns,
+    base: BaseColumns | None = None,
     *,
-    iterations: int = ITERATIONS,
-    enough: float = 0.0,
-    goal: float = np.inf,
+    until: Until = Until(),
     tick: Callable[[], None] = lambda: None,
     pull_at: Callable[[State, int], Pull] | None = None,
 ) -> Fitted:
     """
-    Fit all free numbers of a state by the free-run error; the thresholds of `base` stay.
+    Fit all free numbers of a state by the free-run error; the thresholds of H stay.
 
-    If steps gain too little of their predicted gain, the columns of H are computed again, once.
-    The fit ends after a step that lowers the mean square by less than `enough`, and before a step
-    that promises less.  It also ends if the remaining steps, with equal or falling gains, would
-    not reach the mean square `goal` of the fitted rows.  `tick` is called between the steps, and
-    may raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives information besides the rows,
-    for a state and its number of free numbers.  Singular equations raise IdentificationError, and
-    an effect that cannot run on these data raises ModelError.
+    `base` holds the columns of H, by default those of the state.  They are computed again, once,
+    if steps gain too little of their predicted gain.  `tick` is called between the steps, and may
+    raise `piezo_ident.common.errors.Cancelled`.  `pull_at` gives information besides the rows, for
+    a state and its number of free numbers.  Singular equations raise IdentificationError, and an
+    effect that cannot run on these data raises ModelError.
     """
+    base = base_at(simulator, state) if base is None else base
     fit = _Fit(simulator, state, base, tick, pull_at)
-    last = 0.0
-    for more in reversed(range(iterations)):
+    last, poor = 0.0, 0
+    for more in reversed(range(until.iterations)):
         before = fit.loss
-        least = max(TOLERANCE * before, enough * fit.e.size)
+        least = max(TOLERANCE * before, until.enough * fit.e.size)
         may_renew = more > 1 and fit.base is base and fit.state.law is not None
         promised = fit.step(least)
         if not promised:
             break
         after = fit.loss
         gain = before - after
-        fit.poor = fit.poor + 1 if gain < KEPT[0] * promised else 0
-        is_slow = fit.poor > 0 and may_renew
-        if fit.poor >= POOR and may_renew:
+        poor = poor + 1 if gain < KEPT[0] * promised else 0
+        if poor >= POOR and may_renew:
             # the effects now change H in another way than its columns assume
             fit.base = base_at(simulator, fit.state)
         fit.linearise()
         # a first step, or steps with old columns, say little about later steps
-        is_known = last > 0.0 and not is_slow
-        hopeless = is_known and after - _to_come(gain, last, more) > goal * fit.e.size
-        if hopeless or gain < least:
+        is_known = last > 0.0 and not (poor and may_renew)
+        if is_known and after - _to_come(gain, last, more) > until.goal * fit.e.size:
+            break
+        if gain < least:
             break
         last = gain
     return fit.result()
 
 
-class _Fit:
-    """
-    A fit under way: its state with residual, derivatives and damping.
+def tried(fit: Callable[P, Fitted], *args: P.args, **kwargs: P.kwargs) -> Fitted | None:
+    """Fit; None if an effect runs away on these data, or if the equations are singular."""
+    with suppress(ModelError, IdentificationError):
+        return fit(*args, **kwargs)
+    return None
 
-    `loss` is the sum of squares, with that of the pull.  `poor` counts consecutive steps that
-    gained too little of what they promised.
-    """
+
+class _Fit:
+    """A fit under way; `loss` is the sum of squares of the rows and of the pull."""
 
     def __init__(
         self,
@@ -238,7 +257,7 @@ class _Fit:
         self._simulator, self._tick, self._pull_at = simulator, tick, pull_at
         self._p = base.columns.shape[1] + len(self._parameters)
         self._damping = DAMPING
-        self.state, self.base, self.poor = state, base, 0
+        self.state, self.base = state, base
         self.e = rows.x - simulator.remember(state)
         self._given = pull_at and pull_at(state, self._p)
         self.linearise()
@@ -252,11 +271,7 @@ class _Fit:
         self.loss = _loss(self.e, self._pull)
 
     def step(self, least: float) -> float:
-        """
-        Take one step that lowers the loss; return the gain that it promised.
-
-        The result is 0 if a step promises less than `least`, or if no step lowers the loss.
-        """
+        """Take a step that lowers the loss; return the promised gain, 0 below `least`."""
         rows, parameters = self._simulator.rows, self._parameters
         equations = FitStep(self.base, self._moving, self.e, self._prior, self._pull)
         if self.state.effects and not (np.isfinite(self.loss) and equations.is_finite):
@@ -375,16 +390,3 @@ def least_gain(rows: Rows, noise: float) -> float:
 def good_enough(rows: Rows, noise: float) -> float:
     """Return the mean square below which a residual cannot be separated from the noise."""
     return noise + rows.square(INDISTINCT)
-
-
-def with_fresh_columns(
-    simulator: Simulator, fitted: Fitted, tick: Callable[[], None], *, enough: float = 0.0
-) -> Fitted:
-    """Repeat a fit with columns of H in the state reached, as long as the error falls."""
-    for _ in range(POLISHING):
-        state = fitted.state
-        fresh = fit_jointly(simulator, state, base_at(simulator, state), enough=enough, tick=tick)
-        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
-            break
-        fitted = fresh
-    return fitted

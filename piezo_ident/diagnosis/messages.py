@@ -12,10 +12,10 @@ from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.refined_model import Refined
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.diagnosis.rows import Rows
+from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, WANDERS
 from piezo_ident.diagnosis.verdict import Findings
 from piezo_ident.effects import find_effect
-from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor
 
@@ -64,13 +64,9 @@ def part_judged(rows: Rows) -> list[str]:
     ]
 
 
-def warnings_of(given: StageModel, refined: Refined, floor: NoiseFloor, crept: float) -> list[str]:
-    """
-    List the warnings for a user of the refined model.
-
-    `crept` is the largest displacement through creep from before a record, % of stroke.
-    """
-    state = refined.state
+def warnings_of(simulator: Simulator, refined: Refined, floor: NoiseFloor) -> list[str]:
+    """List the warnings for a user of the refined model."""
+    state, given = refined.state, simulator.model
     found = []
     if not floor.known:
         found.append(f'{floor.source}: every share counts the noise as unexplained')
@@ -80,6 +76,7 @@ def warnings_of(given: StageModel, refined: Refined, floor: NoiseFloor, crept: f
             'identification, or they have changed since'
         )
     if state.fading:
+        crept = simulator.rows.percent(float(np.max(simulator.crept(state) ** 2)))
         found.append(
             f'the stage still crept from motion before a record, by up to {crept:.2g} % of '
             'stroke; this was fitted and is no part of any error. A free run of such a record '

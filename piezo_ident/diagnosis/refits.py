@@ -12,24 +12,24 @@ a step to a wider H only if the step removes most of the error on whole kinds of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import IdentificationError, ModelError
+from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
 from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
 from piezo_ident.diagnosis.equations import BaseColumns, held_out_errors, normal_equations, Pull
 from piezo_ident.diagnosis.joint_fit import (
-    base_at,
     fit_base,
     fit_jointly,
     Fitted,
     POLISH,
     POLISHING,
+    tried,
+    Until,
 )
 from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import means
@@ -84,17 +84,17 @@ def base_thresholds(swing: float) -> np.ndarray:
 
 
 def refit_of(simulator: Simulator, state: State, name: LawName, goal: float = np.inf) -> Fitted:
-    """Refit H within a law with an unchanged G; `goal` as in `fit_jointly`."""
+    """Refit H within a law with an unchanged G; `goal` as in `Until`."""
     low, high = simulator.rows.reach
     swing = max(float(np.ptp(run.u)) for run in simulator.rows.runs)
     law = HysteresisLaw(name, base_thresholds(swing), (min(low, 0.0), max(high, 1.0)))
-    return fit_jointly(simulator, *fit_base(simulator, state, law), goal=goal)
+    return fit_jointly(simulator, *fit_base(simulator, state, law), until=Until(goal=goal))
 
 
 def with_g(simulator: Simulator, fitted: Fitted, goal: float = np.inf) -> Fitted:
-    """Fit again with a retuned G; `goal` as in `fit_jointly`."""
+    """Fit again with a retuned G; `goal` as in `Until`."""
     state = replace(fitted.state, retuning=(0.0,) * len(RETUNING))
-    return fit_jointly(simulator, state, fitted.base, goal=goal)
+    return fit_jointly(simulator, state, fitted.base, until=Until(goal=goal))
 
 
 def walk(
@@ -114,12 +114,10 @@ def walk(
     if candidates.rows.passes < PASSES:
         # a branch that was passed once cannot be held out
         return first
-    # an effect that runs away beside a further H ends the walk
-    with suppress(ModelError):
-        for step in steps:
-            tick()
-            if _left(candidates, step.fitted) <= TAKES * _left(candidates, last.fitted):
-                last = step
+    for step in steps:
+        tick()
+        if _left(candidates, step.fitted) <= TAKES * _left(candidates, last.fitted):
+            last = step
     if best is not None:
         return last
     # a gain is a single number, so it may replace a refit that is only slightly better
@@ -144,35 +142,33 @@ def _steps(
     tick: Callable[[], None],
     goal: Callable[[], float],
 ) -> Iterator[Step]:
-    """
-    Yield one H after the other, from the given H to the widest law.
-
-    A fit ends early if it cannot reach the mean square `goal`.
-    """
+    """Yield one H after the other; `goal` as in `Until`.  A fit that runs away ends the walk."""
     # the best candidate of each treatment comes last, so it stays in the dictionary
     own = candidates.of(() if best is None else best.effects)[::-1]
     known = {c.way: c.fitted for c in own if not c.retunes}
     retuned = {c.way: c.fitted for c in own if c.retunes}
-    state = candidates.as_given.fitted.state
+    first = candidates.as_given.fitted
     if best is not None:
-        state = state.with_effects_of(best.fitted.state)
-    try:
-        first = known.get('given') or fit_jointly(simulator, state, base_at(simulator, state))
-    except ModelError:
-        # beside the given H the effect runs away, so the H of the candidate stays
-        if best is None:
-            raise
-        yield Step(best.way, best.fitted)
-        return
+        state = first.state.with_effects_of(best.fitted.state)
+        beside = known.get('given') or tried(fit_jointly, simulator, state)
+        if beside is None:
+            # beside the given H the effect runs away, so the H of the candidate stays
+            yield Step(best.way, best.fitted)
+            return
+        first = beside
     yield Step('given', first)
-    plays = known.get('plays') or refit_of(simulator, first.state, 'plays', goal())
+    plays = known.get('plays') or tried(refit_of, simulator, first.state, 'plays', goal())
+    if plays is None:
+        return
     yield Step('plays', plays)
     yield from (Step(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
-    of_law = {law_of(known['wide']): known['wide']} if 'wide' in known else {}
+    of_law: dict[LawName, Fitted | None] = {}
+    if 'wide' in known:
+        of_law[law_of(known['wide'])] = known['wide']
 
-    def wide_of(name: LawName, goal: float = np.inf) -> Fitted:
+    def wide_of(name: LawName, goal: float = np.inf) -> Fitted | None:
         if name not in of_law:
-            of_law[name] = refit_of(simulator, first.state, name, goal)
+            of_law[name] = tried(refit_of, simulator, first.state, name, goal)
         return of_law[name]
 
     laws = WIDE
@@ -180,19 +176,22 @@ def _steps(
         # kinds of motion without labels do not restrain lags along the path.  The given H came
         # from other motion, so a law with lags is only tried drawn to the given H
         wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
-        drawn = toward_given(simulator, given, wide, tick)
+        drawn = wide and tried(toward_given, simulator, given, wide, tick)
+        if drawn is None:
+            return
         if drawn is not wide:
             yield Step('drawn', drawn)
         laws = WIDE[:1]
-    wides = [wide_of(name, goal()) for name in laws]
+    wides = [wide for name in laws if (wide := wide_of(name, goal())) is not None]
     yield from (Step('wide', wide) for wide in wides)
+    wide = min(wides, key=partial(_left, candidates), default=None)
     # an effect that changes G leaves nothing for a retuning of G
-    wide = min(wides, key=partial(_left, candidates))
-    if simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
-        known_g = retuned.get('wide')
-        if known_g is None or law_of(known_g) != law_of(wide):
-            known_g = with_g(simulator, wide)
-        yield Step('wide', known_g)
+    if wide and simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
+        last = retuned.get('wide')
+        if last is None or law_of(last) != law_of(wide):
+            last = tried(with_g, simulator, wide)
+        if last is not None:
+            yield Step('wide', last)
 
 
 def with_numerator(simulator: Simulator, step: Step) -> Step:
@@ -211,12 +210,9 @@ def with_numerator(simulator: Simulator, step: Step) -> Step:
         for a in (model.dynamics.a, _poles_of(*mode, model.sample_rate)):
             last = step
             for _ in range(POLISHING):
-                try:
-                    state = _with_other_numerator(simulator, last.fitted.state, a)
-                    fitted = fit_jointly(simulator, state, base_at(simulator, state))
-                except (IdentificationError, ModelError):
-                    break
-                if not fitted.mean_square <= (1.0 - POLISH) * last.fitted.mean_square:
+                fitted = tried(_with_other_numerator, simulator, last.fitted.state, a)
+                most = (1.0 - POLISH) * last.fitted.mean_square
+                if fitted is None or not fitted.mean_square <= most:
                     break
                 last = replace(last, fitted=fitted)
             best = min(best, last, key=lambda one: one.fitted.mean_square)
@@ -230,7 +226,8 @@ def _poles_of(frequency: float, damping: float, sample_rate: float) -> Array:
     return np.array([-2.0 * pole.real, abs(pole) ** 2])
 
 
-def _with_other_numerator(simulator: Simulator, state: State, a: Array) -> State:
+def _with_other_numerator(simulator: Simulator, state: State, a: Array) -> Fitted:
+    """Fit the taps of G behind poles a_1, a_2, ..., and then all else."""
     rows, model = simulator.rows, simulator.model
     G, delay = model.dynamics, model.delay.samples
     first = max(0, delay - EARLIER)
@@ -242,7 +239,7 @@ def _with_other_numerator(simulator: Simulator, state: State, a: Array) -> State
     theta: Array = np.asarray(np.linalg.lstsq(whole, rows.x, rcond=None)[0], dtype=np.float64)
     linear = Dynamics(a, theta[: len(taps)]), Delay(first)
     state = replace(state, retuning=(), linear=linear)
-    return state.with_only_added(theta[len(taps) :])
+    return fit_jointly(simulator, state.with_only_added(theta[len(taps) :]))
 
 
 def law_of(fitted: Fitted) -> LawName:
@@ -263,24 +260,10 @@ def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
     gain = 1.0 + float(theta[0])
     e = fitted.e - columns @ theta
     moved = replace(state, hysteresis=state.hysteresis.scaled(max(gain, 0.0)))
-    moved = replace(
-        moved, offsets=moved.offsets + means(rows.x - e - simulator.run(moved), rows.of_record)
-    )
-    errors, transfer = (
-        held_out_errors(equations, sets, none)[:, 0] for sets in (rows.fold, rows.group)
-    )
-    step = replace(
-        fitted,
-        state=moved,
-        base=base,
-        e=e,
-        moving=np.empty((rows.n, 0)),
-        free=free,
-        parameters=(),
-        prior=none,
-        errors=errors,
-        transfer=transfer,
-    )
+    shifts = means(rows.x - e - simulator.run(moved), rows.of_record)
+    moved = replace(moved, offsets=moved.offsets + shifts)
+    own, kinds = (held_out_errors(equations, x, none)[:, 0] for x in (rows.fold, rows.group))
+    step = Fitted(moved, base, e, np.empty((rows.n, 0)), free, (), none, own, kinds)
     return Step('gain', step, gain)
 
 
@@ -349,4 +332,4 @@ def toward_given(
         return Pull(whole, right, weight * float(left @ left))
 
     state = fitted.state
-    return fit_jointly(simulator, state, base_at(simulator, state), tick=tick, pull_at=pull_at)
+    return fit_jointly(simulator, state, tick=tick, pull_at=pull_at)

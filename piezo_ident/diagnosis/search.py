@@ -13,24 +13,25 @@ model.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache, partial
 from threading import Event
+from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
-from piezo_ident.diagnosis.equations import BaseColumns
+from piezo_ident.common.errors import Cancelled
 from piezo_ident.diagnosis.joint_fit import (
-    base_at,
     fit_base,
     fit_jointly,
     Fitted,
     good_enough,
     least_gain,
     POLISHING,
+    tried,
+    Until,
 )
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.rows import Rows
@@ -65,8 +66,6 @@ PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: the last of the `FINAL` candidates
 LEVEL = 1.05
 
-#: errors that end one start; the other starts continue
-Failure = ModelError | IdentificationError
 #: interval at which a caller may stop the search [s]
 ASKED = 0.1
 
@@ -136,16 +135,16 @@ def search_round(
             trials.setdefault(name, []).append(scored)
     for scores in trials.values():
         scores.sort(key=lambda s: s.error)
-    starts = [
-        (
-            scores[0].effect,
-            # the law with the best small step may not be the law with the best fit
-            [before.state.with_effect(started(columns.rows, s)) for s in scores[:STARTS]],
-        )
+    # the law with the best small step may not be the law with the best fit
+    starts = {
+        scores[0].effect: [
+            before.state.with_effect(started(columns.rows, s)) for s in scores[:STARTS]
+        ]
         for scores in _promising(list(trials.values()), before, noise)
-    ]
+    }
     _add_plain_starts(columns, before, starts)
-    contenders, warnings = _contenders(columns.simulator, before, starts, noise, goal, tick)
+    fits = _JointFits(columns.simulator, before, noise, goal, tick)
+    contenders = fits.to_the_end(fits.begun(starts))
     tick(1.0)
     return Round(
         before=before,
@@ -153,7 +152,7 @@ def search_round(
         contenders=tuple(contenders),
         chance=chance,
         visible=visible,
-        warnings=tuple(warnings),
+        warnings=tuple(fits.warnings),
     )
 
 
@@ -183,9 +182,7 @@ def _promising(trials: Sequence[list[Scored]], before: Fitted, noise: float) -> 
 
 
 def _add_plain_starts(
-    columns: TrialColumns,
-    before: Fitted,
-    starts: Sequence[tuple[type[Effect], list[State]]],
+    columns: TrialColumns, before: Fitted, starts: Mapping[type[Effect], list[State]]
 ) -> None:
     """
     Add to each effect a start beside a sum of plays, converted to the wide law of H.
@@ -198,83 +195,115 @@ def _add_plain_starts(
         return
     plays = HysteresisLaw('plays', law.thresholds, law.span)
     # a start needs no exact fit
-    enough = WORTH_FIT * before.mean_square
-    plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), enough=enough)
+    until = Until(enough=WORTH_FIT * before.mean_square)
+    plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), until=until)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
-    best = best_trials(columns, plain, [effect for effect, _ in starts])
+    best = best_trials(columns, plain, list(starts))
     most = PLAIN_START * float(before.errors.sum())
-    for effect, states in starts:
+    for effect, states in starts.items():
         one = best.get(effect.name)
         if one is not None and (one.error < most or not one.trial.moves):
             states.append(state.with_effect(started(simulator.rows, one)))
 
 
-def _contenders(
-    simulator: Simulator,
-    before: Fitted,
-    starts: Sequence[tuple[type[Effect], Sequence[State]]],
-    noise: float,
-    worth: float,
-    tick: Tick,
-) -> tuple[list[Fitted], list[str]]:
+class _Begun(NamedTuple):
+    """A candidate after a few iterations: its best fit, and its best fit from a wide H."""
+
+    fitted: Fitted
+    beside_wide: Fitted
+
+
+class _JointFits:
     """
-    Fit the candidates jointly; return those that show, the best first, and warnings.
+    Joint fits of the candidates of a round: all of them begin, and the best go to the end.
 
     A fit ends early if it cannot reach the mean square `worth`.
     """
-    contenders, warnings = list[Fitted](), list[str]()
-    beside_wide: dict[str, Fitted] = {}
-    at, least, done = 0.5, before.mean_square, good_enough(simulator.rows, noise)
-    is_visible = cache(lambda fitted: shows(simulator, fitted, noise))
 
-    def alive() -> None:
-        tick(at)
+    def __init__(
+        self, simulator: Simulator, before: Fitted, noise: float, worth: float, tick: Tick
+    ) -> None:
+        self._simulator, self._before, self._worth, self._tick = simulator, before, worth, tick
+        self._enough = least_gain(simulator.rows, noise)
+        #: mean square below which a residual cannot be separated from the noise
+        self._done = good_enough(simulator.rows, noise)
+        self._shows = cache(lambda fitted: shows(simulator, fitted, noise))
+        self._share = 0.5
+        #: candidates whose fits failed
+        self.warnings: list[str] = []
 
-    for i, (effect, states) in enumerate(starts):
-        at = 0.5 + 0.5 * i / len(starts)
-        alive()
-        # a candidate with a small share of the best gain is rarely fitted to the end.  If the best
-        # error is below the noise, only candidates with a similar error are its rivals
-        goal = min(worth, before.mean_square - WORTH_END * (before.mean_square - least))
-        if least < done:
-            goal = min(goal, FORM_RATIO * least + done)
-        found = fit_starts(simulator, states, partial(_begun, before.base, goal), alive)
-        fits = [one for one in found if not isinstance(one, Failure)]
-        least = min([least, *(one.mean_square for one in fits)])
-        # a ModelError means that a law cannot run with these parameters, which needs no warning
-        failures = [one for one in found if isinstance(one, IdentificationError)]
-        if fits:
-            contenders.append(min(fits, key=lambda f: f.mean_square))
-            beside_wide[effect.name] = min(fits[:STARTS], key=lambda f: f.mean_square)
-        elif failures:
-            warnings.append(f'{effect.name} was not judged: {failures[-1]}')
-    contenders.sort(key=lambda c: c.mean_square)
-    gains = [before.mean_square - c.mean_square for c in contenders]
-    is_shown = False
-    # a few iterations cannot rank two candidates with nearly equal errors
-    last = max((c.mean_square for c in contenders[:FINAL]), default=0.0)
-    level = [c for c in contenders if c.mean_square <= LEVEL * last]
-    for i, contender in enumerate(level):
-        if is_shown and gains[0] > 0.0 and gains[i] < WORTH_END * gains[0]:
-            break
-        # a candidate that stays further behind the first is not its rival
-        goal = FORM_RATIO * contenders[0].mean_square + done if is_shown else worth
-        try:
-            fitted = contenders[i] = _to_the_end(simulator, contender, noise, goal, alive)
-            is_shown, other = is_visible(fitted), beside_wide[contender.name]
-            if other is not contender and not (is_shown and fitted.mean_square < done):
-                # a few iterations cannot rank the two bases
-                near = AHEAD * fitted.mean_square
-                goal = min(goal, near) if is_shown else goal
-                other = _to_the_end(simulator, other, noise, goal, alive)
-                ahead = near < other.mean_square
-                if not (ahead and is_shown) and is_visible(other):
-                    contenders[i], is_shown = other, True
-        except (IdentificationError, ModelError) as error:
-            warnings.append(f'{contender.name} was fitted in {FIRST} iterations only: {error}')
-    contenders = list(filter(is_visible, contenders))
-    contenders.sort(key=lambda c: c.mean_square)
-    return contenders, warnings
+    def _alive(self) -> None:
+        self._tick(self._share)
+
+    def begun(self, starts: Mapping[type[Effect], Sequence[State]]) -> list[_Begun]:
+        """Fit all starts of each effect for a few iterations; the best effect comes first."""
+        whole = least = self._before.mean_square
+        found = list[_Begun]()
+        for i, (effect, states) in enumerate(starts.items()):
+            self._share = 0.5 + 0.5 * i / len(starts)
+            self._alive()
+            # a candidate with a small share of the best gain is rarely fitted to the end.  If the
+            # best error is below the noise, only candidates with a similar error are its rivals
+            goal = min(self._worth, whole - WORTH_END * (whole - least))
+            if least < self._done:
+                goal = min(goal, FORM_RATIO * least + self._done)
+            begin = partial(self._begin, Until(FIRST, goal=goal))
+            fits = [one for one in fit_starts(self._simulator, states, begin, self._alive) if one]
+            least = min([least, *map(_error, fits)])
+            if fits:
+                found.append(_Begun(min(fits, key=_error), min(fits[:STARTS], key=_error)))
+            else:
+                self.warnings.append(f'{effect.name} was not judged: its fits fail on these data')
+        return sorted(found, key=lambda one: _error(one.fitted))
+
+    def _begin(
+        self, until: Until, own: Simulator, state: State, tick: Callable[[], None]
+    ) -> Fitted:
+        return fit_jointly(own, state, self._before.base, until=until, tick=tick)
+
+    def to_the_end(self, begun: Sequence[_Begun]) -> list[Fitted]:
+        """Fit the best candidates to the end; return all that show, the best first."""
+        found = [fitted for fitted, _ in begun]
+        gains = [self._before.mean_square - _error(one) for one in found]
+        # a few iterations cannot rank two candidates with nearly equal errors
+        level = LEVEL * max(map(_error, found[:FINAL]), default=0.0)
+        is_shown = False
+        for i, (begun_fit, other) in enumerate(begun):
+            is_far = is_shown and 0.0 < gains[0] and gains[i] < WORTH_END * gains[0]
+            if is_far or _error(begun_fit) > level:
+                break
+            # a candidate that stays further behind the first is not its rival
+            goal = FORM_RATIO * _error(found[0]) + self._done if is_shown else self._worth
+            fitted = tried(self._polished, begun_fit, goal)
+            if fitted is None:
+                self.warnings.append(
+                    f'{begun_fit.name} was fitted in {FIRST} iterations only: the fit fails then'
+                )
+                continue
+            found[i], is_shown = fitted, self._shows(fitted)
+            if other is begun_fit or (is_shown and _error(fitted) < self._done):
+                continue
+            # a few iterations cannot rank the two bases
+            near = AHEAD * _error(fitted)
+            wide = tried(self._polished, other, min(goal, near) if is_shown else goal)
+            is_behind = wide is None or (is_shown and near < _error(wide))
+            if wide is not None and not is_behind and self._shows(wide):
+                found[i], is_shown = wide, True
+        return sorted(filter(self._shows, found), key=_error)
+
+    def _polished(self, fitted: Fitted, goal: float) -> Fitted:
+        """Repeat a fit with fresh columns of H until the gain is too small to matter."""
+        until = Until(enough=self._enough, goal=goal)
+        for _ in range(POLISHING):
+            before = fitted.mean_square
+            fitted = fit_jointly(self._simulator, fitted.state, until=until, tick=self._alive)
+            if _error(fitted) > (1.0 - WORTH_FIT) * before or _error(fitted) < self._done:
+                break
+        return fitted
+
+
+def _error(fitted: Fitted) -> float:
+    return fitted.mean_square
 
 
 def fit_starts(
@@ -282,9 +311,9 @@ def fit_starts(
     states: Sequence[State],
     fit: Callable[[Simulator, State, Callable[[], None]], Fitted],
     tick: Callable[[], None],
-) -> list[Fitted | Failure]:
+) -> list[Fitted | None]:
     """
-    Fit each state, several at a time; return each fit, or the error of a failed fit.
+    Fit each state, several at a time; return each fit, or None if it fails.
 
     `fit` receives a simulator of its own, a state, and a function that it must call between its
     steps.  Meanwhile this thread alone calls `tick`, which may raise `Cancelled`.
@@ -296,17 +325,12 @@ def fit_starts(
         if stopped.is_set():
             raise Cancelled('another fit was stopped')
 
-    def share(k: int) -> list[Fitted | Failure]:
-        found = list[Fitted | Failure]()
-        for state in states[k :: len(copies)]:
-            try:
-                found.append(fit(copies[k], state, alive))
-            except (ModelError, IdentificationError) as error:
-                found.append(error)
-            except BaseException:
-                stopped.set()
-                raise
-        return found
+    def share(k: int) -> list[Fitted | None]:
+        try:
+            return [tried(fit, copies[k], state, alive) for state in states[k :: len(copies)]]
+        except BaseException:
+            stopped.set()
+            raise
 
     with ThreadPoolExecutor(len(copies)) as pool:
         futures = [pool.submit(share, k) for k in range(len(copies))]
@@ -327,27 +351,6 @@ def fit_starts(
         raise error
     shares = [future.result() for future in futures]
     return [shares[i % len(copies)][i // len(copies)] for i in range(len(states))]
-
-
-def _begun(
-    base: BaseColumns, goal: float, simulator: Simulator, state: State, tick: Callable[[], None]
-) -> Fitted:
-    """Fit for a few iterations."""
-    return fit_jointly(simulator, state, base, iterations=FIRST, goal=goal, tick=tick)
-
-
-def _to_the_end(
-    simulator: Simulator, fitted: Fitted, noise: float, goal: float, tick: Callable[[], None]
-) -> Fitted:
-    """Repeat a fit with fresh columns of H until the gain is too small to matter."""
-    enough, done = least_gain(simulator.rows, noise), good_enough(simulator.rows, noise)
-    for _ in range(POLISHING):
-        state, before = fitted.state, fitted.mean_square
-        base = base_at(simulator, state)
-        fitted = fit_jointly(simulator, state, base, enough=enough, goal=goal, tick=tick)
-        if fitted.mean_square > (1.0 - WORTH_FIT) * before or fitted.mean_square < done:
-            break
-    return fitted
 
 
 def gains_of(rows: Rows, this: Round) -> dict[str, float]:

@@ -14,12 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import (
     CLASS_SIZE,
-    IN_PROPORTION,
     PASSES,
     SMALLEST_EFFECT,
     SWALLOWED,
@@ -38,10 +36,7 @@ from piezo_ident.diagnosis.results import (
     Untestable,
 )
 from piezo_ident.diagnosis.search import gains_of, Round
-from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.effects import catalogue, find_effect
-from piezo_ident.identification.spectra import high_passed
-from piezo_ident.model.stage_model import StageModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +62,8 @@ class Findings:
         Error left beyond the noise, rms in % of stroke.
     gain : OtherGain or None
         The other gain, if it explains the error as well as a refit of H.
+    set_in : bool
+        Whether an effect has appeared since the identification.
     """
 
     verdict: str
@@ -77,6 +74,7 @@ class Findings:
     share: float
     left: float
     gain: OtherGain | None = None
+    set_in: bool = False
 
     def unexplained(self, description: str) -> Unexplained:
         """Describe the error left beyond the noise."""
@@ -120,7 +118,8 @@ def judge(
         # the H refitted beside the effects explains a part, too
         times = (whole - rest) / max(sum(gains), 1e-300)
         told = tuple(times * gain for gain in gains)
-        return Findings(verdict, effects, told, group, whole, share, candidates.percent(rest))
+        left, set_in = candidates.percent(rest), decision.set_in
+        return Findings(verdict, effects, told, group, whole, share, left, set_in=set_in)
     after = max(float(last.fitted.errors.sum()) / rows.n - candidates.noise, 0.0)
     left = rows.percent(after)
     as_given = candidates.given
@@ -289,35 +288,3 @@ def errors_of_laws(candidates: Candidates) -> Mapping[str, float]:
         for c in candidates.of(())
         if c.fitted.state.law is not None and not c.retunes
     }
-
-
-def missed_then(model: StageModel) -> float:
-    """Return the error on fast motion at the identification [% of stroke]; 0 if unknown."""
-    known = _entries(model, 'errors')
-    if 'fast_motion' in known:
-        known = {'fast_motion': known['fast_motion']}
-    # a file without this entry holds the error on all motion
-    return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
-
-
-def missed_now(simulator: Simulator) -> float:
-    """
-    Estimate the error of G on the motion in these data, % of stroke.
-
-    The error of G grows with fast motion.  Part of the known error does not belong to G, such as
-    small loops that open less than H predicts.  Only the share `IN_PROPORTION` of the proportional
-    growth therefore counts.
-    """
-    model = simulator.model
-    then = _entries(model, 'fast_displacement').get('percent_of_stroke')
-    missed = missed_then(model)
-    if not isinstance(then, int | float) or not then > 0.0:
-        return missed
-    fast = [high_passed(run.x, run.piece.sample_rate)[run.use] for run in simulator.rows.runs]
-    now = 100.0 * float(np.sqrt(np.mean(np.concatenate(fast) ** 2)))
-    return missed * max(1.0, IN_PROPORTION * now / float(then))
-
-
-def _entries(model: StageModel, name: str) -> Mapping[str, Any]:
-    found = model.identification.get(name)
-    return found if isinstance(found, Mapping) else {}

@@ -12,7 +12,7 @@ import time
 import numpy as np
 from piezo_ident.common.errors import Cancelled, IdentificationError, ModelError
 from piezo_ident.diagnosis.equations import BaseColumns, FitStep, next_damping, Scale
-from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly
+from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly, Until
 from piezo_ident.diagnosis.refits import base_thresholds
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.search import fit_starts
@@ -46,9 +46,9 @@ def crept(gain: float) -> tuple[Simulator, State, BaseColumns]:
 
 def test_h_and_what_multiplies_it_move_together(monkeypatch):
     simulator, state, base = crept(-0.3)
-    together = fit_jointly(simulator, state, base, iterations=6)
+    together = fit_jointly(simulator, state, base, until=Until(iterations=6))
     monkeypatch.setattr(Scale, 'of', lambda *_: 1.0)
-    apart = fit_jointly(simulator, state, base, iterations=6)
+    apart = fit_jointly(simulator, state, base, until=Until(iterations=6))
     squares = [float(np.mean(fitted.e**2)) for fitted in (together, apart)]
     assert squares[0] < 1e-3 * squares[1], squares
     (gain,) = together.state.effects[0].values[0]['gain']
@@ -107,7 +107,8 @@ def test_starts_are_fitted_each_by_itself_and_come_back_in_order():
 
     found = fit_starts(simulator, STATES, fit, lambda: None)
     assert [found[k] for k in (0, 2, 4)] == [0, 2, 4]
-    assert isinstance(found[1], ModelError) and isinstance(found[3], IdentificationError)
+    # a fit that fails leaves the others alone
+    assert found[1] is None and found[3] is None
 
 
 def test_fits_side_by_side_can_be_cancelled():

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.verdict import missed_now, missed_then
+from piezo_ident.diagnosis.base_residual import missed_now, missed_then
 import pytest
 
 RATE = 5000.0
