@@ -347,28 +347,23 @@ def _derivatives(
     parameters: tuple[FreeParameter, ...],
     tick: Callable[[], None],
 ) -> Array:
+    """Compute the derivatives of the rows by the parameters; shape (n, q)."""
     columns = np.zeros((len(parameters), simulator.rows.n))
     tick()
-    steps = [parameter.small(state) for parameter in parameters]
-    quick = simulator.filtered(
-        [(p.effect, p.name, p.index or 0, s) for p, s in zip(parameters, steps, strict=True)]
-    )
     sloped = simulator.sloped([(p.effect, p.name) for p in parameters])
     for j, slope in sloped.items():
         value = parameters[j].get(state)
-        quick[j] = slope * value if parameters[j].logarithmic else slope
-    others = [(j, p) for j, p in enumerate(parameters) if j not in quick]
-    effects = [None if p.effect is None else state.effects[p.effect].effect for _, p in others]
+        columns[j] = slope * value if parameters[j].logarithmic else slope
+    others = [(j, p, p.small(state)) for j, p in enumerate(parameters) if j not in sloped]
+    effects = [None if p.effect is None else state.effects[p.effect].effect for _, p, _ in others]
     moved = [
-        (p.moved(state, steps[j]), effect, p.record)
-        for (j, p), effect in zip(others, effects, strict=True)
+        (p.moved(state, step), effect, p.record)
+        for (_, p, step), effect in zip(others, effects, strict=True)
     ]
-    for j, column in quick.items():
-        columns[j] = column
-    for (j, _), change in zip(others, simulator.varied(moved), strict=True):
+    for (j, _, step), change in zip(others, simulator.varied(moved), strict=True):
         # a bound that depends on other parameters may forbid a move: the derivative is then zero
         if change is not None:
-            columns[j] = change / steps[j]
+            columns[j] = change / step
     return columns.T
 
 

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import functools
 
 import numpy as np
-from piezo_ident.common.arrays import Array
 from piezo_ident.operators.dynamics import Dynamics
 
 #: corner frequencies of the relaxations in a retuned G [Hz]
@@ -36,7 +35,8 @@ def retuning_factor(
     """
     c1, c2, c3, c4 = retuning
     D = np.array([1.0, -1.0])
-    p, (P, Q) = _limit(sample_rate, band), _poles(sample_rate)
+    p = float(np.exp(-2.0 * np.pi * band / sample_rate))
+    P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
     limited, B = (1.0 - p) * D, np.array([1.0, -p])
     BB, PQ = np.convolve(B, B), np.convolve(P, Q)
     terms = (
@@ -48,24 +48,6 @@ def retuning_factor(
     )
     factor = np.sum([np.pad(term, (0, 5 - term.size)) for term in terms], axis=0)
     return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
-
-
-def retuning_terms(sample_rate: float, band: float) -> Array:
-    """Return the filter of each coefficient: b_0, b_1, b_2, a_1, a_2; shape (4, 5)."""
-    p = _limit(sample_rate, band)
-    q, qq = 1.0 - p, (1.0 - p) ** 2
-    slow = [(1.0, -1.0, 0.0, a, 0.0) for _, a in _poles(sample_rate)]
-    return np.array([(q, -q, 0.0, -p, 0.0), (qq, -2.0 * qq, qq, -2.0 * p, p * p), *slow])
-
-
-def _limit(sample_rate: float, band: float) -> float:
-    """Return the pole beyond which D does not grow."""
-    return float(np.exp(-2.0 * np.pi * band / sample_rate))
-
-
-def _poles(sample_rate: float) -> list[Array]:
-    """Return ``1 - p_j z^-1`` of each relaxation."""
-    return [np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS]
 
 
 def retuned(

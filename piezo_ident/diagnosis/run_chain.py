@@ -1,7 +1,12 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the chain of one run, and keep the signals between its links."""
+"""
+Run the chain of one run, and pass small changes of a signal through the links behind H.
+
+Most links are linear, or only add to the signal.  Such a link passes a change without the signal
+itself.  Many columns of a fit therefore pass the links without a run of the whole chain.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +15,96 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.effects import Effect
 from piezo_ident.operators.chain import Block, Operator
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
+from piezo_ident.residual.stretches import block_means
 
 #: size of a scaled derivative that passes a nonlinear link, small enough to act as a small change
 SMALL = 1e-6
+#: approximate number of samples that pass all links together, so that they stay in the cache
+STRETCH = 1 << 14
+
+
+class Behind:
+    """
+    Links of a run behind a place in its chain, with the unchanged signal at each link.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+    rests : sequence of float
+        The signal at rest before each link, and behind the last.
+    blocks : sequence of Block
+        The signal of the whole run at the same places.  The first block is enough if all links are
+        linear.
+    m : int
+        Samples in a row.
+    new : bool, optional
+        Whether the first link has changed since the blocks were kept.
+    """
+
+    def __init__(
+        self,
+        operators: Sequence[Operator],
+        rests: Sequence[float],
+        blocks: Sequence[Block],
+        m: int,
+        *,
+        new: bool = False,
+    ) -> None:
+        self._rests, self._blocks, self._m = rests, blocks, m
+        kinds = [getattr(operator, 'change', 'bent') for operator in operators]
+        if new:
+            kinds[0] = 'bent'
+        links = enumerate(zip(operators, kinds, strict=True))
+        self._links = [(k, one, kind == 'linear') for k, (one, kind) in links if kind != 'passed']
+
+    @property
+    def bends(self) -> bool:
+        """Whether the response to a change is not proportional to the change."""
+        return not all(is_linear for *_, is_linear in self._links)
+
+    def rows(self, change: Array | None = None, rest: float = 0.0) -> Array:
+        """
+        Compute the change of the rows from a change of the incoming signal; shape (n // m,).
+
+        The change, shape (n,), is None if only the first link has changed.  `rest` is the change
+        at rest, before the first sample.
+        """
+        v0 = float(self._blocks[0].v[0])
+        for k, operator, is_linear in self._links:
+            if is_linear:
+                rest = operator.reset(0.0, rest)
+            else:
+                rest = operator.reset(v0, self._rests[k] + rest) - self._rests[k + 1]
+        m, n = self._m, self._blocks[0].x.size
+        step = max(1, STRETCH // m) * m
+        cuts = [slice(a, min(a + step, n // m * m)) for a in range(0, n // m * m, step)]
+        means = [
+            block_means(self._passed(cut, None if change is None else change[cut]), m)
+            for cut in cuts
+        ]
+        return np.concatenate(means) if means else np.empty(0)
+
+    def _passed(self, cut: slice, change: Array | None) -> Array:
+        """Pass a change through the links over a stretch; stretches must come in order."""
+        whole = self._blocks[0]
+        channels = {name: x[cut] for name, x in whole.channels.items()}
+        block = Block(t=whole.t[cut], v=whole.v[cut], x=whole.x[cut], channels=channels)
+        if change is not None:
+            block = block.with_signal(change)
+        for k, operator, is_linear in self._links:
+            if is_linear:
+                block = operator.process(block)
+                continue
+            x = self._blocks[k].x[cut]
+            after = operator.process(block.with_signal(x if change is None else x + block.x))
+            change = after.x - self._blocks[k + 1].x[cut]
+            block = after.with_signal(change)
+        return block.x
 
 
 class RunChain:
@@ -46,15 +132,10 @@ class RunChain:
                 self.blocks.append(block)
         return block.x
 
-    def behind(self, start: int, m: int) -> Behind:
-        """Return the links from a place on for small changes; all blocks must be kept."""
-        parts = self.operators[start:], self.rests[start:], self.blocks[start:]
-        return Behind(*parts, m, small=True)
-
-    def filtered(self, place: int, sections: Array, m: int) -> Array:
-        """Compute the change of all rows if filtered copies of the input of a link are added."""
-        behind = self.behind(place + 1, m)
-        return behind.filtered(sections, self.blocks[place].x, self.rests[place])
+    def behind_core(self, m: int) -> Behind:
+        """Return the links behind H; all blocks must be kept."""
+        start = place_of_core(self.operators) + 1
+        return Behind(self.operators[start:], self.rests[start:], self.blocks[start:], m)
 
     def slopes(self, effect: type[Effect], blocks: Sequence[Block]) -> Mapping[str, Array]:
         """Compute the derivatives that an effect around H knows itself, on kept blocks."""
@@ -63,10 +144,10 @@ class RunChain:
         around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
         return around[0].slopes(blocks[core]) if around else {}
 
-    def behind_core(self, slopes: Sequence[Array], blocks: Sequence[Block], m: int) -> list[Array]:
+    def of_slopes(self, slopes: Sequence[Array], blocks: Sequence[Block], m: int) -> list[Array]:
         """Convert derivatives of the output of H to derivatives of all rows."""
         self.blocks = list(blocks)
-        behind = self.behind(place_of_core(self.operators) + 1, m)
+        behind = self.behind_core(m)
         if not behind.bends:
             return [behind.rows(slope) for slope in slopes]
         sizes = [max(float(np.abs(x).max(initial=0.0)), SMALL**2) / SMALL for x in slopes]

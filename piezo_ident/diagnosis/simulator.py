@@ -22,17 +22,16 @@ from typing import Any, TypeVar
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
-from piezo_ident.diagnosis.changes import Behind
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.retuning import (
     BEYOND,
     retuned,
     retuning_factor,
-    retuning_terms,
 )
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.run_chain import (
     asked_once,
+    Behind,
     columns_of,
     moving_effects,
     place_of,
@@ -152,7 +151,7 @@ class Simulator:
             chain = self._chain(state, i)
             chain.blocks = chains[i].blocks
             core = place_of_core(chain.operators)
-            behind, before = chain.behind(core + 1, self.rows.m), chain.blocks[core]
+            behind, before = chain.behind_core(self.rows.m), chain.blocks[core]
             memory = self.rows.memories[i](law.thresholds)
             kinds = [effect.of_hysteresis for effect in moving_effects(chain.operators[core])]
             changes: Iterator[Array]
@@ -265,43 +264,12 @@ class Simulator:
             found.append(self._joined(known) if len(known) == len(runs) else None)
         return found
 
-    def filtered(self, wanted: Sequence[tuple[int | None, str, int, float]]) -> dict[int, Array]:
-        """
-        Compute derivatives of the rows by the parameters that scale a filter of a signal.
-
-        The derivatives belong to the remembered state, and their keys are places in `wanted`.
-        Each entry of `wanted` holds the place of an effect or (None) the retuning of G, the name
-        of a parameter, the index in a vector, and a step.
-        """
-        kept, rate = self._known(), self.model.sample_rate
-        terms = retuning_terms(rate, self._band)
-        found: dict[int | None, dict[int, Array]] = {}
-        for j, (i, name, k, _) in enumerate(wanted):
-            section: Array | None
-            if i is None:
-                section = terms[k]
-            else:
-                added = kept.state.effects[i]
-                section = added.effect.section(rate, added.values[0], name, k)
-            if section is not None:
-                found.setdefault(i, {})[j] = section
-        columns: dict[int, Array] = {}
-        for i, sections in found.items():
-            effect = None if i is None else kept.state.effects[i].effect
-            steps = np.array([wanted[j][-1] for j in sections])
-            stacked = np.stack(list(sections.values()))
-            # steps scale the numerators, as a link that bends must see a small change
-            stacked[:, :3] *= steps[:, None]
-            parts = self._of_runs(partial(self._filtered, effect, stacked))
-            columns |= dict(zip(sections, self._joined(parts) / steps[:, None], strict=True))
-        return columns
-
     def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
         """
         Compute derivatives of the rows by the parameters whose effect knows its own derivatives.
 
-        The result is as in `filtered`.  Each entry of `wanted` holds the place of an effect, or
-        None, and the name of a parameter.
+        The derivatives belong to the remembered state, and their keys are places in `wanted`.
+        Each entry of `wanted` holds the place of an effect, or None, and the name of a parameter.
         """
         kept = self._known()
         columns: dict[int, Array] = {}
@@ -325,11 +293,7 @@ class Simulator:
     ) -> list[Array]:
         kept, own = self._known(), [slopes[i][names[k]] for k in places]
         chain = self._chain(kept.state, i)
-        return chain.behind_core(own, kept.chains[i].blocks, self.rows.m)
-
-    def _filtered(self, effect: type[Effect] | None, sections: Array, i: int) -> Array:
-        chain = self._known().chains[i]
-        return chain.filtered(place_of(effect, chain.operators), sections, self.rows.m)
+        return chain.of_slopes(own, kept.chains[i].blocks, self.rows.m)
 
     def _of_runs(self, function: Callable[[int], T]) -> list[T]:
         """Apply a function to the place of each run."""

@@ -5,11 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
-from piezo_ident.common.arrays import Array
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.effects.second_order import SecondOrderSection, sections_in_c
 from piezo_ident.effects.trials import ladder
@@ -41,7 +37,7 @@ class ChangedDynamics(Effect):
 
     name = 'changed_dynamics'
     slot = 'output'
-    change = 'filtered'
+    change = 'linear'
     in_dynamics = True
     description = (
         'a resonance added or moved since G was identified, as by a load; linear, the static gain '
@@ -62,17 +58,6 @@ class ChangedDynamics(Effect):
             SecondOrderSection(f, zeta, g, k, self.sample_rate) for f, zeta, g, k in columns
         ]
         self._silent = not np.any([self.array('gain'), self.array('rate_gain')])
-
-    @classmethod
-    def section(
-        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> Array | None:
-        """Compute the filter of a mode, which its gains scale."""
-        if name not in ('gain', 'rate_gain'):
-            return None
-        f, zeta = (float(values[of][index]) for of in ('frequency', 'damping'))
-        unit = (1.0, 0.0) if name == 'gain' else (0.0, 1.0)
-        return SecondOrderSection(f, zeta, *unit, sample_rate).section
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

@@ -61,7 +61,7 @@ class Creep(Effect):
 
     name = 'creep'
     slot = 'hidden'
-    change = 'filtered'
+    change = 'linear'
     description = (
         'slow motion after each change of the voltage; 1 .. 2 % a decade of time, 1 .. 5 % in all'
     )
@@ -103,16 +103,6 @@ class Creep(Effect):
                 'take the start from this model'
             )
         self._beyond = beyond[self._seen] if beyond.size else np.zeros(self._c.size)
-
-    @classmethod
-    def section(
-        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> Array | None:
-        """Compute the filter of an element, which its share scales."""
-        if name != 'gain':
-            return None
-        share = -np.expm1(-1.0 / (sample_rate * float(values['time_constant'][index])))
-        return np.array([share, 0.0, 0.0, share - 1.0, 0.0])
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

@@ -147,10 +147,9 @@ class Effect:
     in_dynamics : bool
         Whether the effect is linear, so that an identification with the effect puts it into G.
     change : str
-        Response of the effect to a small change of its signal.  ``passed``: the change passes,
-        because the effect only adds a signal of its own.  ``filtered``: a filter that depends
-        neither on the signal nor on time.  ``scaled``: `slope` times the change, of any size.
-        ``curved``: `slope` times the change, if it is small.  ``bent``: any other response.
+        Response of the effect to a change of its signal.  ``passed``: the change passes, because
+        the effect only adds a signal of its own.  ``linear``: the effect of the change alone.
+        ``bent``: any other response.
     of_hysteresis : str
         Dependence of the part that the effect adds in the slot ``hysteresis`` on the coefficients
         of H: ``not``, ``linear`` or ``bent`` (nonlinear).
@@ -185,7 +184,7 @@ class Effect:
     time_driven: ClassVar[bool] = False
     rate_independent: ClassVar[bool] = False
     in_dynamics: ClassVar[bool] = False
-    change: ClassVar[Literal['passed', 'filtered', 'scaled', 'curved', 'bent']] = 'bent'
+    change: ClassVar[Literal['passed', 'linear', 'bent']] = 'bent'
     of_hysteresis: ClassVar[Literal['not', 'linear', 'bent']] = 'bent'
     in_delay_line: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
@@ -327,21 +326,6 @@ class Effect:
         own = steps or {}
         far = tuple(float(own.get(name, known[name].step)) for name, _ in moves)
         return Trial(values, moves, far)
-
-    @classmethod
-    def section(
-        cls, sample_rate: float, values: Mapping[str, Any], name: str, index: int
-    ) -> Array | None:
-        """
-        Compute the filter of the signal whose output a number of a list scales and adds.
-
-        The filter is b_0, b_1, b_2, a_1 and a_2; None if the number does not scale a filter.
-        """
-        return None
-
-    def slope(self, block: Block) -> Array:
-        """Compute the slope of an effect that is ``scaled`` or ``curved``, shape (n,)."""
-        return np.ones_like(block.x)
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """

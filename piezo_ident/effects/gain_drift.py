@@ -51,7 +51,7 @@ class GainDrift(Effect):
 
     name = 'gain_drift'
     slot = 'output'
-    change = 'scaled'
+    change = 'linear'
     description = 'a gain that wanders during the record with temperature or age'
     needs = 'the same motion at the start and at the end of a long record'
     time_driven = True
@@ -113,10 +113,6 @@ class GainDrift(Effect):
         if not self.array('gain').any():
             return block
         return block.with_signal(self._scaled(np.ascontiguousarray(block.x), block.t))
-
-    def slope(self, block: Block) -> Array:
-        """Compute one plus the gain at each time."""
-        return self._scaled(np.ones(block.t.size), block.t)
 
     def _scaled(self, x: Array, t: Array) -> Array:
         time, gain = self.array('time'), self.array('gain')

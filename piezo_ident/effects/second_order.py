@@ -89,12 +89,6 @@ class SecondOrderSection:
         """Coefficients n_0, n_1, a_1 and a_2 of the filter of differences."""
         return self._c
 
-    @property
-    def section(self) -> Array:
-        """Coefficients b_0, b_1, b_2, a_1 and a_2 of the filter."""
-        n0, n1, a1, a2 = self._c
-        return np.array([n0, n1 - n0, -n1, a1, a2])
-
     def reset(self, x0: float) -> None:
         """Come to rest under a constant input; the output is then zero."""
         self._state = np.array([x0, 0.0, 0.0])

@@ -30,7 +30,6 @@ class SensorNonlinearity(Effect):
 
     name = 'sensor_nonlinearity'
     slot = 'output'
-    change = 'curved'
     rate_independent = True
     description = (
         'a curved characteristic of the sensor; strain gauge 0.1 .. 1 %, capacitive 0.01 .. 0.1 %'
@@ -54,12 +53,6 @@ class SensorNonlinearity(Effect):
     def process(self, block: Block) -> Block:
         """Apply the curve of the sensor to the block."""
         return block.with_signal(self._read(block.x))
-
-    def slope(self, block: Block) -> Array:
-        """Compute the slope of the curve."""
-        c2, c3, c4 = (self.number(name) for name in ('square', 'cubic', 'fourth'))
-        x = block.x
-        return 1.0 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4)))
 
     def c_code(self) -> CCode:
         """Write the effect in C."""

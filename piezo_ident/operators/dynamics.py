@@ -210,7 +210,7 @@ class DynamicsOperator:
     `change` has the meaning of `piezo_ident.effects.effect.Effect.change`.
     """
 
-    change = 'filtered'
+    change = 'linear'
 
     def __init__(self, dynamics: Dynamics) -> None:
         self.dynamics = dynamics
@@ -273,7 +273,7 @@ class Delay:
 class DelayOperator:
     """z^-d as an operator."""
 
-    change = 'filtered'
+    change = 'linear'
 
     def __init__(self, delay: Delay) -> None:
         self.delay = delay

@@ -841,7 +841,7 @@ def test_what_is_kept_from_the_run_before_changes_nothing():
         ('creep', 'changed_dynamics', 'thermal_drift'),
     ],
 )
-def test_quick_derivatives_are_differences_of_whole_runs(effects):
+def test_changes_of_rows_are_differences_of_whole_runs(effects):
     model, record, _ = measured(None, 0.0, 1, every=4)
     # numbers that follow time are those of one record
     records = [record, replace(record, name='again')] if 'gain_drift' in effects else [record]
@@ -868,25 +868,16 @@ def test_quick_derivatives_are_differences_of_whole_runs(effects):
     now = simulator.remember(state)
     whole = Simulator(model, rows)
     columns = base_at(simulator, state).columns
-    # a curve passes changes by its mean slope in a row
-    near = 1e-4 if 'sensor_nonlinearity' in effects else 1e-7
     for j in (0, 2, law.size - 2):
         more = state.with_coefficients(law, state.coefficients + 1e-3 * np.eye(law.size)[j])
-        np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=near)
+        np.testing.assert_allclose(columns[:, j], (whole.run(more) - now) / 1e-3, atol=1e-7)
     parameters = free_parameters(state, count)
-    filtered = simulator.filtered([(p.effect, p.name, p.index or 0, p.step) for p in parameters])
-    # those of the retuning, and of shares
-    assert len(filtered) >= 4
-    for j, parameter in enumerate(parameters):
+    for parameter in parameters:
         moved = parameter.moved(state, parameter.step)
         effect = None if parameter.effect is None else chosen[parameter.effect].effect
         [difference] = simulator.varied([(moved, effect, parameter.record)])
         # a difference of whole runs holds the rounding of both
         np.testing.assert_allclose(difference, whole.run(moved) - now, atol=1e-10)
-        if j in filtered:
-            change = filtered[j] * parameter.step
-            largest = np.abs(difference).max()
-            np.testing.assert_allclose(change, difference, 0, max(1e-9, near * largest))
 
 
 def test_retuning_is_the_product_with_its_factor():
