@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Refit H, and find what the residual shows before effects are searched: faults, lines and noise.
+Refit H, and find faults, lines and noise in the residual, before effects are searched.
 
 H is refitted by the free-run error, so that an error of H is not mistaken for an effect.  The
 remaining residual gives lines and the noise floor, and thereby the error to explain.
@@ -47,7 +47,7 @@ from piezo_ident.residual.faults import FaultSearch
 HUM = 'periodic_disturbance'
 #: share of the voltage range within which the command counts as resting with noise
 TREMBLES = 0.01
-#: the displacement does not follow the voltage if a larger share of its variance stays unexplained
+#: a larger unexplained share of its variance shows a displacement that ignores the voltage
 UNRELATED = 0.99
 #: the displacement runs against the model if their correlation is lower; no change of a stage
 #: causes this
@@ -128,8 +128,8 @@ def base_residual(simulator: Simulator, faults: FaultSearch) -> BaseResidual:
     channels, lines, floor = _beside_the_drive(simulator, wide.state)
     noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
-    # while a memory settles, periods differ by more than the noise, and the estimated noise is too
-    # large; no model errs by less than the noise, so the smallest error bounds it
+    # the estimated noise is too large while a memory settles: periods then differ.  No model errs
+    # by less than the noise, so the smallest error bounds it
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
     single = None if single is None else single - excess
     missed, noise = missed_now(simulator), noise - excess
@@ -156,7 +156,7 @@ def _beside_the_drive(
     # another axis that moves in sines causes lines, too
     parts = without_channels(parts, channels)
     found = find_lines(parts, all_stretches(parts))
-    # hum and another axis are no noise, as an effect can explain them
+    # effects can explain hum and another axis: only the rest is noise
     resting = _parts(simulator, state, whole=True)
     quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
     return channels, found, residual_noise_floor(quiet, all_stretches(resting))
@@ -196,9 +196,8 @@ def missed_now(simulator: Simulator) -> float:
     """
     Estimate the error of G on the motion in these data, % of stroke.
 
-    The error of G grows with fast motion.  Part of the known error does not belong to G, such as
-    small loops that open less than H predicts.  Only the share `IN_PROPORTION` of the proportional
-    growth therefore counts.
+    The error of G grows with fast motion.  A part of the known error belongs to H, so only the
+    share `IN_PROPORTION` of a proportional growth counts.
     """
     model = simulator.model
     then = _entries(model, 'fast_displacement').get('percent_of_stroke')

@@ -7,8 +7,8 @@ List the candidates: each treatment of H and G, with each effect, then with one 
 The hysteresis of a piezo is never exactly a sum of plays.  An effect that already acted during the
 identification has also distorted the identified H and G.  Effects are therefore tried beside the H
 that fits best.  They are also tried with a retuned G if retuning alone clearly lowers the error.
-A wide enough H can imitate each effect that follows the path of the voltage.  Such effects are
-therefore tried beside the H as given, too.
+A wide enough H can imitate each effect that follows the path of the voltage, so these effects are
+tried beside the H as given, too.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Tick = Callable[[float], None]
 
 
 class CandidateSearch:
-    """Search that fits the candidates of some data; `effects` names those that may be added."""
+    """Search that fits the candidates of some data: sets of some effects."""
 
     def __init__(
         self,
@@ -64,10 +64,9 @@ class CandidateSearch:
 
     def shown(self, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
         """
-        Add each effect that a test of its own has shown; return the fit and the added names.
+        Add effects that tests of their own have shown; return the fit and the added names.
 
-        Each such effect must lower the mean square by at least `SMALLEST_EFFECT`, beside the
-        effects added before it.
+        Each must lower the mean square by at least `SMALLEST_EFFECT`, beside the effects before.
         """
         fitted = self._residual.wide
         least = self._simulator.rows.square(SMALLEST_EFFECT)

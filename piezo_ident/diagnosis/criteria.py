@@ -17,8 +17,8 @@ from __future__ import annotations
 
 #: smallest size of an effect that is named: real laws differ from textbook laws by about as much
 SMALLEST_EFFECT = 0.05
-#: a change of G must exceed the error of G at its identification; if the fast motion has grown,
-#: this error grows by this share of the ratio.  Part of the error was small loops, not G
+#: a change of G must exceed the error of G at its identification.  The error grows by this share
+#: of the growth of the fast motion: the rest of it was small loops, not G
 IN_PROPORTION = 0.5
 #: the zero of the sensor has moved if the mean error of a record is so many times the other error
 MOVED_ZERO = 3.0
@@ -27,17 +27,16 @@ MOVED_ZERO = 3.0
 
 #: passes over the voltage range that held-out data need: a branch passed once has no second half
 PASSES = 3.0
-#: a gain is significant if it exceeds the largest gain on circular-shift surrogates by this
-#: factor: chance exceeds the largest gain in 1 of 17 cases, and the factor allows for many
-#: candidates
+#: a significant gain exceeds the largest gain on circular-shift surrogates by this factor.  Chance
+#: exceeds the largest gain in 1 of 17 cases, and the factor allows for many candidates
 BEYOND_CHANCE = 1.5
 #: a difference is significant from so many standard errors over held-out blocks (95 % of a normal
 #: variable)
 STANDARD_ERRORS = 2.0
 #: accepted range of the factor of an effect in the place where it alone acts; 1 is exact
 SHOWS = (0.4, 3.0)
-#: a candidate is not testable if a smaller share of its columns lies outside the span of the base:
-#: its amplitude is then known a hundred times less accurately
+#: a testable candidate has a larger share of its columns outside the span of the base.  At this
+#: share its amplitude is known a hundred times less accurately
 SWALLOWED = 1e-4
 #: share of the mean square of the noise that is always added to the error: the noise is known to
 #: about this share

@@ -5,22 +5,21 @@
 Decide which candidate is taken, from the errors of all candidates on held-out data.
 
 A candidate is a set K of effects beside one treatment of H and G.  Its error E is the geometric
-mean of two mean squares: of blocks held out in spread sets, and of whole kinds of motion held out.
-The error of a set is the error of its best treatment:
+mean of two mean squares: with spread sets of blocks held out, and with whole kinds of motion held
+out.  The error of a set is the error of its best treatment:
 
     left(K) = max(E(K) - noise, 0) + NOISE_SHARE noise.
 
-A set is admissible if it lowers the error by at least the smallest effect, and if each of its
-effects removes most of the error that is left without this effect.  Beside another effect, this
-must hold for the blocks alone, too.  The decision takes the admissible set with the smallest
-error, or a set with fewer parameters and about the same error.  Sets of the same size with a
-slightly larger error are its rivals; the set and its rivals form a class.  Size decides instead of
-significance: in 100,000 samples any law of the right trend gains a significant part.
+A set is admissible if it lowers the error by at least the smallest effect.  Each of its effects
+must also remove most of the error that is left without this effect.  A second effect must do so on
+spread blocks alone, too.  The admissible set with the smallest error is taken, or a set with about
+the same error and fewer parameters.  Sets of the same size with a slightly larger error are its
+rivals; the set and its rivals form a class.  Size decides instead of significance: in 100,000
+samples any law of the right trend gains a significant part.
 
-A wide enough H can imitate an effect that follows the path of the voltage, so such an effect gains
-little beside a refitted H.  If the effect appeared after the identification, the H as given lacks
-it.  If one such effect beside the given H does most of the work of a refitted H, the effect is the
-finding.
+A wide H can imitate an effect that follows the path of the voltage, so such an effect gains little
+beside a refitted H.  If the effect has set in since the identification, the H as given lacks it.
+The effect is then the finding if it does most of the work of a refit beside the given H.
 """
 
 from __future__ import annotations
@@ -55,15 +54,8 @@ class Candidate:
     """
     A set of effects beside one treatment of H and G, fitted.
 
-    Attributes
-    ----------
-    effects : tuple of str
-        Names, sorted, without the effects that tests of their own have shown.
-    way : str
-        Treatment of H: 'given', 'plays' or 'wide'.
-    fitted : Fitted
-    found_in : Round or None
-        The search that produced the candidate.
+    The effects are sorted, without the effects that tests of their own have shown.  The way is the
+    treatment of H: 'given', 'plays' or 'wide'.  `found_in` is the search that found the candidate.
     """
 
     effects: tuple[str, ...]
@@ -87,15 +79,8 @@ class Candidates:
     """
     All candidates of some data.
 
-    Attributes
-    ----------
-    rows : Rows
-    noise : float
-        Mean square of the noise of a row.
-    missed : float
-        Possible error of G on this motion, derived from its error at the identification, rms in %
-        of stroke.  A smaller change of G cannot be detected.
-    all : tuple of Candidate
+    The noise is the mean square of the noise of a row.  `missed` is the possible error of G on
+    this motion, rms in % of stroke: a smaller change of G cannot be detected.
     """
 
     rows: Rows
@@ -125,10 +110,6 @@ class Candidates:
         """Subtract the noise from a mean square, then add a share of the noise."""
         return max(square - self.noise, 0.0) + self.least_share
 
-    def _of_blocks(self, candidate: Candidate) -> float:
-        """Compute the error beyond the noise on blocks held out in spread sets alone."""
-        return self.beyond_noise(candidate.fitted.mean_square)
-
     def percent(self, left: float) -> float:
         """Convert an error to rms in % of stroke."""
         return self.rows.percent(left - self.least_share)
@@ -139,7 +120,7 @@ class Candidates:
 
     def of(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> tuple[Candidate, ...]:
         """
-        Return the candidates of a set, the best first; empty if the set has no candidate.
+        Return the candidates of a set, the best first.
 
         A retuned G is a change of G, too.  Candidates with a retuned G are left out if the set, or
         the set `beside`, changes G.
@@ -172,7 +153,8 @@ class Candidates:
         best = self.best(effects)
         if not effects or best is None or self.rows.passes < PASSES:
             return False
-        left, given = self.left(best), self._as_given(effects)
+        left = self.left(best)
+        given = min(self.left(c) for c in self.of((), effects) if c.way == 'given')
         if given - left < self.rows.square(SMALLEST_EFFECT):
             return False
         for part in _parts(effects):
@@ -185,7 +167,8 @@ class Candidates:
             if left > most * before:
                 return False
             # beside another effect, whole kinds of motion must not be the only evidence
-            if part and self._of_blocks(best) > most * self._of_blocks(other):
+            own, rest = (self.beyond_noise(c.fitted.mean_square) for c in (best, other))
+            if part and own > most * rest:
                 return False
             changes = change_g(tuple(set(effects) - set(part)))
             if changes and self.rows.percent(before - left) < self.missed:
@@ -198,7 +181,8 @@ class Candidates:
     def _missed_by_g(self, part: tuple[str, ...]) -> float:
         """Compute the least error of a set plus a change of G within the known error of G."""
         before, found = self.best(part), math.inf
-        for name in (name for name in self._names if change_g([name])):
+        names = {name for c in self.all for name in c.effects if change_g([name])}
+        for name in names:
             other = self.best(tuple(sorted((*part, name))))
             if before is None or other is None:
                 continue
@@ -207,18 +191,9 @@ class Candidates:
         return found
 
     @property
-    def _names(self) -> set[str]:
-        return {name for c in self.all for name in c.effects}
-
-    def _as_given(self, effects: tuple[str, ...]) -> float:
-        """Compute the error of the model with the H as given."""
-        return min(self.left(c) for c in self.of((), effects) if c.way == 'given')
-
-    @property
     def as_given(self) -> Candidate:
         """The model as it was given."""
-        found = (c for c in self.of(()) if c.way == 'given' and not c.retunes)
-        return next(found)
+        return next(c for c in self.of(()) if c.way == 'given' and not c.retunes)
 
     @property
     def given(self) -> float:
@@ -226,22 +201,13 @@ class Candidates:
         return self.left(self.as_given)
 
     def like_refit(self) -> tuple[Candidate, ...]:
-        """
-        Return the effects of the path that, beside the given H, do most of the work of a refit.
-
-        The effect with the smallest error comes first.
-        """
+        """Return the effects of the path that do most of the work of a refit; the best first."""
         given, refit = self.given, self.left(self.without())
         if given - refit < self.rows.square(SMALLEST_EFFECT) or self.rows.passes < PASSES:
             return ()
-        own = [
-            c
-            for c in self.all
-            if c.way == 'given'
-            and len(c.effects) == 1
-            and find_effect(c.effects[0]).rate_independent
-        ]
-        found = [c for c in own if self.left(c) - refit <= TAKES * (given - refit)]
+        single = [c for c in self.all if c.way == 'given' and len(c.effects) == 1]
+        path = [c for c in single if find_effect(c.effects[0]).rate_independent]
+        found = [c for c in path if self.left(c) - refit <= TAKES * (given - refit)]
         return tuple(sorted(found, key=self.left))
 
 
@@ -253,23 +219,18 @@ class Decision:
     Attributes
     ----------
     best : Candidate or None
-        The candidate that was taken; None if no effect was found.
-    rivals : tuple of tuple of str
-        Sets of the same size that are not separated from the best set, ordered by error.
-    names : tuple of str
-        A class: names of the effects in the best set and in its rivals that not every set
-        contains.
+        The candidate that was taken, if an effect was found.
     whole : float
-        Error to explain, a mean square.  It is the error of the best H and G without an effect.
-        For an effect that appeared after the identification, it is the error of the model as
-        given.
+        Error to explain, a mean square: the error of the best H and G without an effect.  For an
+        effect that has set in since the identification, the error of the model as given.
+    names : tuple of str
+        A class: effects of the best set and of its rivals that some of these sets lack.
     set_in : bool
-        Whether an effect has appeared since the identification.
+        Whether an effect has set in since the identification.
     """
 
     best: Candidate | None
     whole: float
-    rivals: tuple[tuple[str, ...], ...] = ()
     names: tuple[str, ...] = ()
     set_in: bool = False
 
@@ -281,28 +242,25 @@ def decide(candidates: Candidates) -> Decision:
     if not bests:
         return _set_in(candidates)
     best = _simplest(candidates, bests)
-    rivals = rivals_of(candidates, best)
+    rivals = _rivals_of(candidates, best)
     common = set(best.effects).intersection(*rivals)
     names = dict.fromkeys(itertools.chain(best.effects, *rivals))
-    told = tuple(n for n in names if n not in common) if rivals else ()
-    return Decision(best, candidates.left(candidates.without(best.effects)), rivals, told)
+    told = tuple(n for n in names if n not in common)
+    return Decision(best, candidates.left(candidates.without(best.effects)), told)
 
 
 def _set_in(candidates: Candidates) -> Decision:
-    """
-    Decide whether an effect has set in, if no set is admissible beside the best H.
-
-    Without labels the earlier error on other motion is unknown, so the decision stays empty.  The
-    same holds for loops that are not congruent: the H of any material has some from the beginning.
-    """
+    """Decide whether an effect has set in, if no set is admissible beside the best H."""
     found = candidates.like_refit()
+    # without labels the earlier error on other motion is unknown, and the H of any material has
+    # some loops that are not congruent from the beginning
     if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
         return Decision(None, candidates.left(candidates.without()))
     best = _simplest(candidates, found)
     most = RIVALS * candidates.left(best)
     rivals = [c for c in found if c is not best and candidates.left(c) <= most]
     names = tuple(c.effects[0] for c in (best, *rivals)) if rivals else ()
-    return Decision(best, candidates.given, tuple(c.effects for c in rivals), names, set_in=True)
+    return Decision(best, candidates.given, names, set_in=True)
 
 
 def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
@@ -312,28 +270,16 @@ def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
     return min(alike, key=lambda c: (c.size, candidates.left(c)))
 
 
-def rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...], ...]:
-    """
-    Return the sets of equal size that are not separated from the best set, ordered by error.
-
-    Their errors are at most slightly larger.  If the best set explains only a part, the law of the
-    remaining error is unknown.  A set is then a rival, too, if it removes most of the error that
-    the best set removes.
-    """
+def _rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of equal size that are not separated from the best set, by their errors."""
     left, whole = candidates.left(best), candidates.left(candidates.without(best.effects))
     most = RIVALS * left
     if candidates.is_part(left, whole):
+        # the law of the remaining error is unknown: a rival may remove most of the same error
         most = max(most, left + TAKES * (whole - left))
-    found = []
-    for other in candidates.sets:
-        if len(other) != len(best.effects) or other == best.effects:
-            continue
-        if best.effects in _narrower(other):
-            continue
-        rival = candidates.best(other, best.effects)
-        if rival is not None and candidates.left(rival) <= most:
-            found.append(other)
-    return tuple(found)
+    others = [s for s in candidates.sets if len(s) == len(best.effects) and s != best.effects]
+    bests = [candidates.best(s, best.effects) for s in others if best.effects not in _narrower(s)]
+    return tuple(c.effects for c in bests if c is not None and candidates.left(c) <= most)
 
 
 def change_g(effects: Sequence[str]) -> bool:
@@ -348,7 +294,7 @@ def _parts(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
 
 
 def _narrower(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield the sets with an effect in the place of one that contains it."""
+    """Yield the sets with an effect in the place of a wider effect."""
     for name in effects:
         for other in find_effect(name).contains:
             yield tuple(sorted({*effects, other} - {name}))

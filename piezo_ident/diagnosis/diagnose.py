@@ -4,13 +4,13 @@
 """
 Diagnose a model: from measured data to the effect that the model lacks.
 
-1. Faults of the data are found and left out.
-2. H is refitted by the free-run error, so that an error of H is not mistaken for an effect.
-3. The remaining residual gives lines and the noise floor, and thereby the error to explain.
-4. The candidates are fitted: each treatment of H and G, with each effect, then with one more
-   (`candidates`, by rounds of `search`).
-5. One ratio decides (`decision`).  A walk over whole kinds of motion gives H (`refits`).  The
-   verdict (`verdict`) and the refined model (`refined_model`) follow.
+1. `base_residual` leaves faults of the data out and refits H.  The remaining residual gives lines
+   and the noise, and thereby the error to explain.
+2. `candidates` fits each treatment of H and G, then with each effect, then with one more effect.
+   `search` finds the effects of a round: `trial_scores` scores them, `fit` fits the best.
+3. `decision` takes a candidate by one ratio.
+4. `refits` chooses the H of the refined model, by whole kinds of motion.
+5. `verdict` judges, `refined_model` builds the model, and `messages` words the result.
 """
 
 from __future__ import annotations
@@ -116,8 +116,7 @@ def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list
     """
     Cut records to their beginnings, in proportion to their lengths, to `most` samples in total.
 
-    A search needs 0.9 to 1.3 kB of memory for each sample.  Creep and hysteresis depend on earlier
-    motion, and only the beginning of a record has none.
+    Creep and hysteresis depend on earlier motion, so a part must begin where the record begins.
     """
     usable = [
         (record, [p for p in record if same_rate(p.sample_rate, model.sample_rate)])
@@ -223,7 +222,7 @@ def _result(
             *(warning for one in rounds for warning in one.warnings),
         ),
         settings=settings,
-        law='' if refined.keeps_h or last.way == 'gain' else law_of(last.fitted),
+        law='' if refined.h_is_given or last.way == 'gain' else law_of(last.fitted),
         errors_of_laws=errors_of_laws(candidates),
         kinds=rows.kinds,
         gain=findings.gain,

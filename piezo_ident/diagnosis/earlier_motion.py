@@ -35,11 +35,10 @@ def with_earlier_motion(
     simulator: Simulator, fitted: Fitted, tick: Callable[[], None] = lambda: None
 ) -> Fitted:
     """
-    Return the fit, with creep from earlier motion if that helps clearly.
+    Add creep from earlier motion to a fit with creep, if that helps clearly.
 
-    A fit or model without creep stays unchanged.  The earlier creep must lower the error on
-    held-out blocks to `EARLIER_LEAVES` of it.  Its size must be possible after motion within the
-    range.  `tick` is called between the steps of a fit.
+    The earlier creep must lower the error on held-out blocks to `EARLIER_LEAVES` of it.  Its size
+    must be possible after motion within the range.  `tick` is called between the steps of a fit.
     """
     state = fitted.state
     creep = _creep_of(simulator, state)
@@ -76,12 +75,9 @@ def _creep_of(simulator: Simulator, state: State) -> Mapping[str, Any]:
 
 
 def _is_possible(simulator: Simulator, state: State) -> bool:
-    """
-    Return whether creep can have caused the displacements at the start of each record.
-
-    The earlier voltage of each element stayed within the range.  A record that begins at the
-    lowest voltage can therefore only sink through creep.  A drift may rise, and may be larger.
-    """
+    """Return whether creep can have caused the displacements at the start of each record."""
+    # the earlier voltage stayed within the range: a record that begins at the lowest voltage can
+    # only sink through creep, and a drift may rise
     rows, values = simulator.rows, _creep_of(simulator, state)
     gains, times = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
     # faster elements compensate for dynamics

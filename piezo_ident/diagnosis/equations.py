@@ -32,11 +32,7 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """
-    Normal equations of columns M and one or several residuals, block by block.
-
-    A, b and s have shapes (blocks, p, p), (blocks, p, k) and (blocks, k).
-    """
+    """Normal equations of k residuals by blocks: (blocks, p, p), (blocks, p, k), (blocks, k)."""
 
     A: Array
     b: Array
@@ -49,11 +45,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """
-    Normal equations of information besides the blocks.
-
-    A and b have shapes (p, p) and (p,).  s is the present sum of squares.
-    """
+    """Normal equations of other information, shapes (p, p) and (p,); present sum of squares."""
 
     A: Array
     b: Array
@@ -103,7 +95,7 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
     """
     Solve a ridge regression for its coefficients; b has shape (p,) or (p, k).
 
-    The diagonal grows by the prior, shape (p,), and by `RIDGE` times each column's own energy.
+    The diagonal grows by the prior, shape (p,), and by `RIDGE` times the energy of each column.
     Singular equations raise IdentificationError.
     """
     # a column may live in one set alone; rounding then leaves a slightly negative energy
@@ -135,8 +127,7 @@ def held_out_errors(
     """
     Compute the squared error of every block, predicted from other sets; shape (blocks, k).
 
-    Blocks with the same number in `sets`, shape (blocks,), are left out together.  The prior is
-    that in `solve`.  The pull always counts.
+    Blocks with the same number in `sets`, shape (blocks,), are left out together.
     """
     A, b = summed(equations, pull)
     errors = equations.s.copy()
@@ -155,10 +146,8 @@ def held_out_residual(
     """
     Compute the residual of every row, predicted with parameters fitted to other blocks.
 
-    M holds the derivatives of the prediction, and e is the residual of the fit to all rows.
-    Blocks with the same number in `sets`, shape (blocks,), are left out together.  Near the
-    optimum the model is linear in its parameters.  Without a set of blocks, the parameters
-    therefore move by one Gauss-Newton step.
+    M holds the derivatives of the prediction, and e is the residual of the fit to all rows.  Near
+    the optimum one Gauss-Newton step gives the parameters of a fit without a set of blocks.
     """
     equations = normal_equations(rows, M, e[:, None])
     A, b = summed(equations, pull)
@@ -186,11 +175,9 @@ SEEN = 0.01
 @dataclass(frozen=True, eq=False)
 class BaseColumns:
     """
-    Columns of a refit of the base model, shape (n, size + records), and ``columns' columns``.
+    Columns of a refit of H and of the offsets, shape (n, size + records), and their products.
 
-    The columns belong to the coefficients of H, filtered through G, and to the offset of each
-    record.  `products` holds the products of each block, shape (blocks, p, p), and `total` their
-    sum.
+    `products` holds the products of each block, shape (blocks, p, p), and `total` their sum.
     """
 
     columns: Array
@@ -208,9 +195,9 @@ class Scale:
     """
     Ratio of H at the output of the chain to H as its columns predict it.
 
-    Links behind H multiply H: creep, a gain, and parts that the columns omit.  A joint step of H
-    and such a link contains a product.  Without this product a fit takes many small steps.  The
-    columns `aside`, shape (n, k), only add to the signal, so they do not change the ratio.
+    Creep, a gain, and parts that the columns omit multiply H.  A joint step of H and such a link
+    contains a product, and a fit without this product takes many small steps.  The columns
+    `aside`, shape (n, k), only add to the signal, so they do not change the ratio.
     """
 
     def __init__(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -55,14 +56,13 @@ def held_out_kinds(
     Assign each block to a kind of motion, shape (blocks,), and name the kinds.
 
     `labels` holds the label of each block, and `commands` its rows.  The smallest kinds are
-    joined.  If the labels name fewer than two kinds, the kinds follow from mean, size and speed of
-    the command.  If that gives too few kinds, parts of the time replace them.
+    joined.  Mean, size and speed of the command replace missing labels.  Parts of the time replace
+    them if the command has too few kinds.
     """
-    sizes = [u.size for u in commands]
-    size: dict[str, int] = {}
-    for label, n in zip(labels, sizes, strict=True):
-        size[label] = size.get(label, 0) + int(n)
-    large = sorted(size, key=lambda label: -size[label])
+    size: Counter[str] = Counter()
+    for label, u in zip(labels, commands, strict=True):
+        size[label] += u.size
+    large = [label for label, _ in size.most_common()]
     large = [label for label in large if label.partition(':')[0] not in ('idle', 'ramp')]
     names = large if len(large) < GROUPS else large[: GROUPS - 1]
     number = {label: i for i, label in enumerate(names)}
@@ -85,15 +85,11 @@ def held_out_kinds(
 
 
 def _by_command(commands: Sequence[Array]) -> tuple[Integers, tuple[str, ...]] | None:
-    """
-    Assign each block to a kind by its command; None if the kinds are too few.
-
-    A kind at the edge of place, size or speed would require extrapolation.  Blocks of such a kind
-    are held out in spread sets instead.
-    """
+    """Assign each block to a kind by its command, if the command has enough kinds."""
     kinds = kinds_of(np.array([description(u) for u in commands]))
     if kinds is None:
         return None
+    # kinds at the edge of place, size or speed would require extrapolation: they are spread
     spread = KINDS + interleaved(kinds.size)
     group = np.unique(np.where(kinds < 0, spread, kinds), return_inverse=True)[1]
     return group, (ALIKE,) * (int(group.max()) + 1)

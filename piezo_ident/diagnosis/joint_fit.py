@@ -88,17 +88,15 @@ class Fitted:
 
     Attributes
     ----------
-    state : State
-    base : BaseColumns
-        Columns that were used for H.
+    state, base : State, BaseColumns
+        The fitted state, and the columns of H that the fit used.
     e : ndarray, shape (n,)
         Residual of the rows, measured minus predicted, normalised.
     moving : ndarray, shape (n, q)
         Derivatives of the prediction by the free parameters.
     free : ndarray of bool, shape (p,)
         Columns that are not on a bound.
-    parameters : tuple of FreeParameter
-    prior : ndarray, shape (p,)
+    parameters, prior : tuple of FreeParameter, ndarray, shape (p,)
     errors, transfer : ndarray, shape (blocks,)
         Sum of squares of each block, held out in spread sets and in whole kinds of motion.
     pull : Pull or None
@@ -133,22 +131,11 @@ class Fitted:
         """Mean square error of the blocks held out in spread sets, normalised."""
         return float(self.errors.sum() / self.e.size)
 
-    @property
-    def reached(self) -> float:
-        """
-        Mean square error of held-out blocks, or of the fit itself if that is larger.
-
-        If the columns belong to another state, the held-out error may promise a step that is
-        impossible.
-        """
-        return max(self.mean_square, float(self.e @ self.e / self.e.size))
-
     def held_out_residual(self, rows: Rows, sets: Integers | None = None) -> Array:
         """
         Compute the residual of every row with parameters fitted to other blocks; shape (n,).
 
-        The residual is normalised.  Blocks with the same number in `sets` are held out together;
-        the default are sets spread over all data.
+        Blocks with the same number in `sets`, by default spread sets, are held out together.
         """
         prior = self.prior if sets is None else firm(rows, self.state, self.prior, self.moving)
         sets = rows.fold if sets is None else sets
@@ -171,11 +158,7 @@ def fit_base(simulator: Simulator, state: State, law: HysteresisLaw) -> tuple[St
 
 
 def base_at(simulator: Simulator, state: State) -> BaseColumns:
-    """
-    Compute the columns of a refit of H in a state with its effects and a retuned G.
-
-    An H without a law stays fixed: the columns are then the additive columns alone.
-    """
+    """Compute the columns of H, if H has a law, and of the offsets in a state."""
     rows, added = simulator.rows, simulator.added_columns(state)
     if state.law is None:
         return BaseColumns.of(rows, added)

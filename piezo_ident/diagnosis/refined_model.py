@@ -10,6 +10,7 @@ The effects that were added are reported with their shares and parameters.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -33,7 +34,7 @@ NOTHING = 1e-9
 @dataclass(frozen=True, eq=False)
 class Refined:
     """
-    Refined model, the state of its fit, and whether the whole model or H stays as given.
+    Refined model, the state of its fit, and whether the whole model, or its H, stays as given.
 
     `shifts` holds the movement of the zero of the sensor in each record [m], shape (records,).
     """
@@ -41,18 +42,8 @@ class Refined:
     model: StageModel
     state: State
     shifts: Array
-    is_given: bool = False
-    h_is_given: bool = False
-
-    @property
-    def keeps_h(self) -> bool:
-        """Whether the model keeps the H as given."""
-        return self.is_given or self.h_is_given
-
-
-def lasting(effects: tuple[str, ...]) -> list[str]:
-    """Select the effects that will act in another record, too."""
-    return [name for name in effects if not find_effect(name).time_driven]
+    is_given: bool
+    h_is_given: bool
 
 
 def refine(
@@ -65,61 +56,52 @@ def refine(
     """
     Build the refined model for the user from the last step of the walk and the findings.
 
-    `errors` holds the errors of the model as given and of the last step.  The model file records
-    them.
+    Its file records the errors of the model as given and of the last step, `errors`.
     """
     rows, model = simulator.rows, simulator.model
     fitted, h_is_given = last.fitted, last.way == 'given'
     e = rows.x - simulator.run(given)
     shifts = moved_zeros(rows, given, e)
     if h_is_given and not findings.effects:
-        return Refined(model, given, shifts * model.scaling.Y, is_given=True)
+        return Refined(model, given, shifts * model.scaling.Y, is_given=True, h_is_given=True)
     # beside an effect that was found, a smaller shift is visible, too
     hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
     shifts = np.where(shifts == 0.0, hidden, shifts)
     state = replace(fitted.state, offsets=fitted.state.offsets - shifts)
     kept = _at_given_gain(simulator, given, state)
     # gain and drift in the next record are unknown
-    lasts = not findings.effects or bool(lasting(findings.effects))
+    lasts = not findings.effects or not all(find_effect(x).time_driven for x in findings.effects)
     span = model.scaling.range if h_is_given else _range(simulator)
     told = errors if lasts and kept is state else errors[:1]
     refined = _model(simulator, kept, findings, span, told)
-    return Refined(refined, state, shifts * model.scaling.Y, h_is_given=h_is_given)
+    return Refined(refined, state, shifts * model.scaling.Y, False, h_is_given)
 
 
 def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
-    """
-    Return a state in which a wandering gain has the mean of the model as given.
-
-    The next record need not have the mean gain of these records.  H was identified at the given
-    gain, which includes the added effects as far as they already acted then.
-    """
+    """Return a state in which a wandering gain has the mean gain of the model as given."""
     kept = [_elsewhere(added) for added in state.effects]
     if not any(added.name == WANDERS for added in kept):
         return state
     others, state = tuple(added for added in kept if added.name != WANDERS), state.from_rest()
-    of_record = simulator.rows.of_record
-    x, known = (
-        centred(simulator.run(s), of_record) for s in (replace(state, effects=others), given)
-    )
+    # the next record need not have the mean gain of these records; H was identified at the given
+    # gain
+    runs = (simulator.run(s) for s in (replace(state, effects=others), given))
+    x, known = (centred(run, simulator.rows.of_record) for run in runs)
     gain = float(x @ known / (x @ x)) - 1.0
-    effects = [
-        added if added.name != WANDERS else added.changed(None, 'gain', 0, gain) for added in kept
-    ]
+    effects = (a.changed(None, 'gain', 0, gain) if a.name == WANDERS else a for a in kept)
     return replace(state, effects=tuple(effects))
 
 
 def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: Array) -> Array:
     """
-    Find hidden shifts of the zero of the sensor, one for each record, normalised; 0 if none.
+    Find hidden shifts of the zero of the sensor, normalised, shape (records,); 0 if none.
 
     An effect that the given model lacks can imitate a shift.  Two estimates must therefore agree
-    in sign, and the smaller counts: the mean error of the given model, and the displacement at
-    rest relative to the given model.  An effect that already acted during the identification
-    distorts at most one of the two.  The shift must exceed `MOVED_ZERO` times a limit.  The limit
-    is the larger of the remaining error and the expected error of the given model, but at most the
-    error of the given model on this record.  `before` holds the mean squared error of the given
-    model on each record, shape (records,).
+    in sign: the mean error of the given model, and the displacement at rest relative to the given
+    model.  An effect that already acted during the identification distorts at most one of the two.
+    The smaller estimate counts.  It must exceed `MOVED_ZERO` times the remaining error or the
+    expected error of the given model.  The error of the given model is enough.  `before` holds the
+    mean square of that error in each record, shape (records,).
     """
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))
@@ -143,10 +125,10 @@ def _at_rest(model: StageModel) -> float:
 
 def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
     """
-    Find clear shifts of the zero of the sensor, one for each record, normalised; 0 if none.
+    Find clear shifts of the zero of the sensor, normalised, shape (records,); 0 if none.
 
-    Any wrong model has some mean error, so a shift must be several times the other error.  e is
-    the residual of the model as given without its mean, shape (n,).
+    Any wrong model has some mean error, so a shift must be several times the other error e, shape
+    (n,).
     """
     rms = np.sqrt(means(e * e, rows.of_record))
     return np.where(np.abs(given.offsets) > MOVED_ZERO * rms, given.offsets, 0.0)
@@ -184,25 +166,18 @@ def _model(
         rest = simulator.run(given) - simulator.run(replace(state, effects=kept))
         offset += float(rest[rows.of_record == k].mean())
     moved = replace(scaling, y0=scaling.y0 + offset * scaling.Y, range=span)
-    provenance = {
-        **model.identification,
-        'diagnosis': {
-            'verdict': findings.verdict,
-            'effects': list(findings.effects),
-            'records': list(rows.names),
-            'errors': {
-                'unit': '% of stroke',
-                'formula': FORMULA,
-                **{
-                    name: float(e.overall)
-                    for name, e in zip(('before', 'after'), errors, strict=False)
-                },
-                # error on the worst kind of motion
-                **({'worst': float(max(errors[-1].by_segment.values()))} if errors else {}),
-            },
-        },
+    told: dict[str, Any] = {'unit': '% of stroke', 'formula': FORMULA}
+    told |= zip(('before', 'after'), (float(e.overall) for e in errors), strict=False)
+    if errors:
+        # error on the worst kind of motion
+        told['worst'] = float(max(errors[-1].by_segment.values()))
+    own = {
+        'verdict': findings.verdict,
+        'effects': list(findings.effects),
+        'records': list(rows.names),
+        'errors': told,
     }
-    return replace(model, scaling=moved, identification=provenance)
+    return replace(model, scaling=moved, identification={**model.identification, 'diagnosis': own})
 
 
 def _elsewhere(added: Added) -> Added:
@@ -250,8 +225,8 @@ def _standard_deviations(rows: Rows, fitted: Fitted) -> dict[tuple[int | None, s
     """
     Compute the standard deviations of the free parameters in the record with most rows.
 
-    The sandwich estimator treats each block as one observation.  A key holds the place of the
-    effect, the name of the parameter, and the index in a vector (0 for a number).
+    The sandwich estimator treats each block as one observation.  A key holds the place of an
+    effect, the name of a parameter, and an index.
     """
     M = fitted.J
     size = np.linalg.norm(M, axis=0)

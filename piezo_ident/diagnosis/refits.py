@@ -4,9 +4,9 @@
 """
 Refit H, and walk to the H of the refined model.
 
-Held-out blocks between fitted blocks must not choose H: a wide H with a retuned G may fit such
-blocks well and err widely under other motion.  The walk therefore begins at the given H.  It takes
-a step to a wider H only if the step removes most of the error on whole kinds of motion.
+Held-out blocks between fitted blocks must not choose H.  A wide H with a retuned G may fit such
+blocks well and err widely under other motion.  The walk begins at the given H.  Each step to a
+wider H must remove most of the error on whole kinds of motion.
 """
 
 from __future__ import annotations
@@ -31,15 +31,14 @@ from piezo_ident.diagnosis.joint_fit import (
     tried,
     Until,
 )
-from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import means
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import State
+from piezo_ident.diagnosis.state import RETUNING, State
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 
-#: taps of a new numerator of G: the first comes so many samples earlier, as the delay may have
-#: imitated the effect; and the fewest (physics: a mode needs three, and a filter behind it one)
+#: a new numerator of G begins so many samples earlier, as the delay may have imitated the effect;
+#: its fewest taps (physics: a mode needs three, and a filter behind the mode needs one)
 EARLIER, LEAST_TAPS = 3, 4
 #: laws of H that are wider than plays: one with loops that are not congruent, one with lags, too
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
@@ -48,16 +47,9 @@ WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
 @dataclass(frozen=True, eq=False)
 class Step:
     """
-    One H of the walk.
+    One H of the walk: 'given', 'gain', 'plays', 'drawn' (wide, towards the given H) or 'wide'.
 
-    Attributes
-    ----------
-    way : {'given', 'gain', 'plays', 'drawn', 'wide'}
-        The H as given; with another gain; refitted as plays; wide and drawn to the given H; or
-        wide.
-    fitted : Fitted
-    gain : float
-        Gain relative to the given H, if only the gain has changed.
+    `gain` is relative to the given H, if only the gain has changed.
     """
 
     way: str
@@ -66,11 +58,7 @@ class Step:
 
 
 def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
-    """
-    Refit H as plays on a fine grid, and as the wider law with the smaller error.
-
-    A voltage that never moves raises IdentificationError.
-    """
+    """Refit H as plays, and as the better wide law; the voltage must move."""
     if max(float(np.ptp(run.u)) for run in simulator.rows.runs) == 0.0:
         raise IdentificationError('the voltage never moves; record the stage while it is driven')
     plays, *wide = (refit_of(simulator, given, name) for name in ('plays', *WIDE))
@@ -173,8 +161,8 @@ def _steps(
 
     laws = WIDE
     if not simulator.rows.kinds:
-        # kinds of motion without labels do not restrain lags along the path.  The given H came
-        # from other motion, so a law with lags is only tried drawn to the given H
+        # only labels restrain lags along the path.  The given H came from other motion, so a law
+        # with lags is only tried drawn to the given H
         wide = wide_of(next(law_of(c.fitted) for c in candidates.of(()) if c.way == 'wide'))
         drawn = wide and tried(toward_given, simulator, given, wide, tick)
         if drawn is None:
@@ -299,16 +287,15 @@ def toward_given(
     """
     Repeat a fit of rows without labelled kinds of motion, drawn to the given H.
 
-    Such rows do not test a refitted H under other motion.  The given H was identified on other
-    motion, so it counts as data, too:
+    Rows without labels do not test a refitted H under other motion.  The given H was identified on
+    other motion, so it counts as data, too:
 
         min  |e|^2 + n mean((h - h_0 - c)^2)
 
-    Here h and h_0 are the new and the given H under loops over the range of the model.  n is the
-    number of rows.  c is the mean difference, which offsets compensate.  The given H keeps terms
-    small that these rows hardly determine.  Such terms compensate for one another on these rows,
-    but not elsewhere.  The given H does not count if the data cover only a part of the range: the
-    refined model then holds in this part only.
+    h and h_0 are the new and the given H under loops over the range of the model, and n is the
+    number of rows.  Offsets compensate the mean difference c.  The given H keeps terms small that
+    compensate for one another on these rows, but not elsewhere.  It does not count if the data
+    cover only a part of the range: the refined model then holds in this part only.
     """
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     if law is None or rows.kinds or not rows.covers(scaling.range):

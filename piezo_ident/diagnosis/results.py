@@ -13,7 +13,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
-from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Piece
 from piezo_ident.selection.judged import Promise
 
@@ -30,10 +30,8 @@ class DiagnosisSettings:
 
     Attributes
     ----------
-    effects : tuple of str, optional
-        Candidates; by default the whole catalogue.
-    without : tuple of str
-        Candidates to leave out.
+    effects, without : tuple of str
+        Candidates, by default the whole catalogue, and candidates to leave out.
     most_effects : int
         Largest number of effects that are added.
     most_samples : int
@@ -221,22 +219,16 @@ class Diagnosis(Showable):
         Best first.
     before, refit, after : Errors
         Errors of three models.  `before`: the model as given.  `refit`: the refitted base model,
-        on held-out blocks.  `after`: the refined model, on whole held-out kinds of motion.  An
-        effect that depends on time counts in `after` with its parameters in these records.  So
-        does the H refitted with it.  The refined model omits both if nothing else was found.
-    noise_floor : float or None
+        on held-out blocks.  `after`: the refined model, on whole held-out kinds of motion.  In
+        `after` effects of time, and the H refitted with them, count as in these records.  The
+        refined model omits both if nothing else was found.
+    noise_floor, noise_source : float or None, str
         Rms of single samples, % of stroke.
-    noise_source : str
     smallest_detectable : float or None
         Rms of the smallest effect that would have been taken, % of stroke.
-    untestable : tuple of Untestable
-    faults : tuple of Fault
-    residuals : tuple of Residual
-    records : tuple of str
+    untestable, faults, residuals, records, warnings, settings
     blocks : int
         Number of blocks that were held out in turn.
-    warnings : tuple of str
-    settings : DiagnosisSettings
     unseen : tuple of Unseen
         Errors on records that took no part.
     law : str
@@ -313,14 +305,14 @@ class Diagnosis(Showable):
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """Changes from the given to the refined model in words; empty if there are none."""
+        """Changes from the given to the refined model in words."""
         return changes(self.given, self.model)
 
 
 def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
-    """List the changes from a given to a refined model in words; empty if there are none."""
+    """List the changes from a given to a refined model in words."""
     texts = []
-    # a play without weight has no effect
+    # plays without weight do nothing
     old, new = (m.hysteresis.without_idle().numbers for m in (given, refined))
     if not np.array_equal(old, new):
         texts.append('H refitted')
@@ -333,14 +325,12 @@ def changes(given: StageModel, refined: StageModel) -> tuple[str, ...]:
         texts.append('G retuned')
     before = {e.name: _frozen(e.parameters) for e in given.effects}
     after = {e.name: _frozen(e.parameters) for e in refined.effects}
-    texts += [_with(e) for e in refined.effects if e.name not in before]
+    for e in refined.effects:
+        idle = find_effect(e.name).is_neutral(e.parameters)
+        if e.name not in before:
+            texts.append(f'with {e.name}{", switched off" if idle else ""}')
     texts += [f'{name} refitted' for name in after if before.get(name, after[name]) != after[name]]
     return (*texts, *(f'without {name}' for name in sorted(set(before) - set(after))))
-
-
-def _with(added: EffectSetting) -> str:
-    idle = find_effect(added.name).is_neutral(added.parameters)
-    return f'with {added.name}{", switched off" if idle else ""}'
 
 
 def _frozen(values: Mapping[str, object]) -> list[tuple[str, str]]:

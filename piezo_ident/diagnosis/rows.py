@@ -53,10 +53,8 @@ class Rows:
     ----------
     runs : tuple of Run
         Uniformly sampled pieces, normalised by the model's scaling.
-    record : ndarray of int, shape (runs,)
-        The record that each run belongs to.
-    names : tuple of str
-        Names of the records.
+    record, names : ndarray of int, shape (runs,), tuple of str
+        The record of each run, and the names of the records.
     begin : ndarray, shape (runs,)
         Start of the record of each run [s], as a drift begins with the record, whatever its clock
         was set to.  Zero if an effect of the model already depends on the time of the clock.
@@ -67,18 +65,15 @@ class Rows:
     m : int
         Samples in a row.
     keep : tuple of ndarray of bool
-        For each run, the rows that count.  Most samples of such a row are sound, and the unknown
-        start no longer affects it, except through wide plays.
+        For each run, the rows that count: sound for the most part, and behind the unknown start.
     x : ndarray, shape (n,)
         Measured displacement of the rows, normalised.
     block, of_record : ndarray of int, shape (n,)
         Block and record of each row.
     fold, group : ndarray of int, shape (blocks,)
         Numbers of blocks that are held out together: spread over all data, or as kinds of motion.
-    label : tuple of str
-        Segment label of each block.
-    labels : tuple of str
-        Name of each group.
+    label, labels : tuple of str
+        Segment label of each block, and name of each group.
     stroke : float
         Largest range of the displacement in a record, normalised.
     """
@@ -113,12 +108,10 @@ class Rows:
     @functools.cached_property
     def highest_frequency(self) -> float:
         """Frequency below which all but a millionth of the moving power of each run lies [Hz]."""
-        found = [0.0]
-        for run, keep in zip(self.runs, self.keep, strict=True):
-            if (rows := np.flatnonzero(keep)).size:
-                u = run.u[rows[0] * self.m : (rows[-1] + 1) * self.m]
-                found.append(highest_frequency(u, run.piece.sample_rate))
-        return max(found)
+        pairs = ((run, np.flatnonzero(k)) for run, k in zip(self.runs, self.keep, strict=True))
+        judged = ((r, slice(k[0] * self.m, (k[-1] + 1) * self.m)) for r, k in pairs if k.size)
+        found = (highest_frequency(run.u[cut], run.piece.sample_rate) for run, cut in judged)
+        return max(found, default=0.0)
 
     @functools.cached_property
     def reach(self) -> tuple[float, float]:
@@ -206,27 +199,20 @@ class Rows:
         return (size * self.stroke / 100.0) ** 2
 
     def errors(self, e: Array, noise: float) -> Errors:
-        """
-        Compute the errors of a normalised residual of the rows, shape (n,).
-
-        `noise` is the mean square of the noise of single samples that the averaging to rows
-        removed.
-        """
+        """Compute the errors of a residual, shape (n,); `noise` was lost by averaging to rows."""
 
         def error(part: Array) -> float:
             return self.percent(float(np.mean(part**2)) + noise)
 
-        by_segment: dict[str, float] = {}
-        of_frequency: dict[float, list[Array]] = {}
-        for label in dict.fromkeys(self.label):
-            part = e[np.array([x == label for x in self.label])[self.block]]
-            by_segment[label] = error(part)
+        labels = np.array(self.label)[self.block]
+        parts = {label: e[labels == label] for label in dict.fromkeys(self.label)}
+        sines: dict[float, list[Array]] = {}
+        for label, part in parts.items():
             frequency = sine_frequency(label)
             if frequency is not None:
-                of_frequency.setdefault(frequency, []).append(part)
-        by_frequency = {
-            f'{f:g}': error(np.concatenate(of_frequency[f])) for f in sorted(of_frequency)
-        }
+                sines.setdefault(frequency, []).append(part)
+        by_segment = {label: error(part) for label, part in parts.items()}
+        by_frequency = {f'{f:g}': error(np.concatenate(sines[f])) for f in sorted(sines)}
         return Errors(error(e), by_segment, by_frequency)
 
     def of(self, signals: Sequence[Array]) -> Array:

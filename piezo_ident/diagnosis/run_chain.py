@@ -4,8 +4,8 @@
 """
 Run the chain of one run, and pass small changes of a signal through the links behind H.
 
-Most links are linear, or only add to the signal.  Such a link passes a change without the signal
-itself.  Many columns of a fit therefore pass the links without a run of the whole chain.
+Most links are linear, or only add to the signal.  They pass a change without the signal itself.
+Many columns of a fit therefore pass the links without a run of the whole chain.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class _Once(HysteresisOperator):
 
 
 def asked_once(operator: Operator, answer: list[Any]) -> Operator:
-    """Return a link whose H keeps its last output in a list; a link without H stays unchanged."""
+    """Return a link whose H, if any, keeps its last output in a list."""
     core = _core(operator)
     if not isinstance(core, HysteresisOperator):
         return operator
@@ -205,8 +205,8 @@ def columns_of(
     """
     Yield the response of H, with the effects around it, to each of some coefficients.
 
-    The blocks of the chain must be kept, with H at the place `core`.  `memory` and `places` are
-    those of `HysteresisLaw.columns`.
+    The blocks of the chain must be kept, with H at the place `core`; `memory` and `places` as in
+    `HysteresisLaw.columns`.
     """
     before, rest = chain.blocks[core], chain.rests[core]
     moving = moving_effects(chain.operators[core])

@@ -4,11 +4,9 @@
 """
 Run one round of the search: find the candidates that lower the error on held-out data.
 
-Each candidate is tried by finite differences of the whole model, with the effect switched slightly
-on.  Its score is the gain of its columns on held-out blocks, beside all other columns of the
-model.  The gain is compared with the gain on circular-shift surrogates of the residual, which
-chance alone produces.  The most promising candidates are then fitted together with the rest of the
-model.
+Each candidate is tried with its effect switched slightly on (`trial_scores`).  The gain is
+compared with the gain on surrogates of the residual, which chance alone produces.  The most
+promising candidates are then fitted together with the rest of the model.
 """
 
 from __future__ import annotations
@@ -51,19 +49,17 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 #: number of surrogates of the residual: chance exceeds their largest gain in 1 of 17 cases
 SURROGATES = 16
-#: share of the error that a candidate must gain at its trial to be fitted jointly, and the largest
-#: number of joint fits in a round
+#: share of the error that a trial must gain for a joint fit, and most joint fits in a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
 #: a fit is stopped early if it gains a smaller share of the best gain after a few iterations
 WORTH_END = 0.5
-#: number of trials of a candidate that start a joint fit, iterations of this fit, and number of
-#: candidates of a round that are fitted to the end
+#: trials of a candidate that start a joint fit, iterations of this fit, and candidates of a round
+#: that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: a trial beside a sum of plays is a start up to the first multiple of the error before; another
-#: start, and another candidate, is given up beyond the second and third multiple of the best error
+#: multiples of an error: a trial beside plays is a start up to this multiple of the error before.
+#: Beyond these multiples of the best error, another start and another candidate are given up
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
-#: a further candidate is fitted to the end if its error is at most this factor times the error of
-#: the last of the `FINAL` candidates
+#: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
 
 #: interval at which a caller may stop the search [s]
@@ -82,14 +78,13 @@ class Round:
     best : dict of str to Scored
         The best trial of every candidate that could be tried.
     contenders : tuple of Fitted
-        Candidates after the joint fit, ordered by error.  Candidates that do not show in the
-        places of `signature` are left out.
+        Candidates after the joint fit that show, ordered by error.
     chance : dict of str to float
         Largest mean square that a candidate gains on surrogates of the residual.
     visible : dict of str to float
-        Share of a candidate's own columns that a refit of the rest cannot imitate.
+        Share of the columns of a candidate that a refit of the rest cannot imitate.
     warnings : tuple of str
-        Candidates whose joint fit failed, and why.
+        Candidates whose joint fit failed.
     """
 
     before: Fitted
@@ -98,11 +93,6 @@ class Round:
     chance: dict[str, float]
     visible: dict[str, float]
     warnings: tuple[str, ...]
-
-    @property
-    def gain(self) -> float:
-        """Mean square that the best contender gains."""
-        return self.before.mean_square - self.contenders[0].mean_square
 
 
 def search_round(
@@ -187,8 +177,8 @@ def _add_plain_starts(
     """
     Add to each effect a start beside a sum of plays, converted to the wide law of H.
 
-    A wide H that has absorbed an effect rarely releases it.  A start with a far larger error than
-    before is left out.  An effect that is either on or off keeps its start in any case.
+    A wide H that has absorbed an effect rarely releases it.  A start with a far larger error is
+    left out, unless the effect is either on or off.
     """
     simulator, law = columns.simulator, before.state.law
     if not starts or law is None or law.name == 'plays':
@@ -316,7 +306,7 @@ def fit_starts(
     Fit each state, several at a time; return each fit, or None if it fails.
 
     `fit` receives a simulator of its own, a state, and a function that it must call between its
-    steps.  Meanwhile this thread alone calls `tick`, which may raise `Cancelled`.
+    steps.  This thread alone calls `tick`, which may raise `Cancelled`.
     """
     copies = simulator.copies(len(states))
     stopped = Event()

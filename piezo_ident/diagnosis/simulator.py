@@ -23,11 +23,6 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
-from piezo_ident.diagnosis.retuning import (
-    BEYOND,
-    retuned,
-    retuning_factor,
-)
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.run_chain import (
     asked_once,
@@ -38,7 +33,13 @@ from piezo_ident.diagnosis.run_chain import (
     place_of_core,
     RunChain,
 )
-from piezo_ident.diagnosis.state import Added, State
+from piezo_ident.diagnosis.state import (
+    Added,
+    BEYOND,
+    retuned,
+    retuning_factor,
+    State,
+)
 from piezo_ident.effects import Effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
@@ -114,8 +115,7 @@ class Simulator:
         """
         Filter the columns of a law through G, and append the rows `more`; shape (size + k, n).
 
-        Effects are left out of these columns.  Effects change the columns by a few percent, and
-        this only alters the path to the optimum.
+        The columns omit effects, which change them by a few percent: the optimum stays.
         """
         # the widest law contains the terms of all narrower laws except the bias
         wide = law if law.name == 'bias' else replace(law, name=LAWS[-1])
@@ -139,10 +139,10 @@ class Simulator:
 
     def columns(self, state: State, law: HysteresisLaw, step: float, more: Array) -> Array:
         """
-        Compute the change of the rows for a step of each coefficient of H; shape (size + k, n).
+        Compute the change of the rows, per step, for a step of each coefficient of H.
 
-        The state must be remembered.  The changes are divided by the step.  The rows `more`, shape
-        (k, n), are appended.
+        The state must be remembered.  The rows `more`, shape (k, n), are appended; the result has
+        the shape (size + k, n).
         """
         chains = self._known(state).chains
 
@@ -211,13 +211,11 @@ class Simulator:
     def full(self, state: State) -> list[Array]:
         """Predict each run at the full rate, normalised."""
         outputs = self._of_runs(lambda i: self._chain(state, i).output())
-        added = state.offsets[self.rows.record]
-        if not state.fading:
-            return [x + offset for x, offset in zip(outputs, added, strict=True)]
-        return [
-            x + added[i] + state.earlier[k] @ self.rows.fading(i, state.fading)
-            for i, (x, k) in enumerate(zip(outputs, self.rows.record, strict=True))
-        ]
+        found = [x + state.offsets[k] for x, k in zip(outputs, self.rows.record, strict=True)]
+        if state.fading:
+            for i, k in enumerate(self.rows.record):
+                found[i] += state.earlier[k] @ self.rows.fading(i, state.fading)
+        return found
 
     def remember(self, state: State) -> Array:
         """Predict the rows, and keep the signals between the links."""
@@ -241,8 +239,7 @@ class Simulator:
         Compute the difference of the rows of each state from the rows of the remembered state.
 
         Each state differs in one place, an effect or (None) the factor of G, in one record or
-        (None) in all.  The chain runs only from this place on.  The result is None for a state
-        that cannot run.
+        (None) in all.  The chain runs from this place on.  A state that cannot run has None.
         """
         chains, runs = self._known().chains, range(len(self._sources))
 
@@ -266,10 +263,10 @@ class Simulator:
 
     def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
         """
-        Compute derivatives of the rows by the parameters whose effect knows its own derivatives.
+        Compute the derivatives that effects of the remembered state know themselves.
 
-        The derivatives belong to the remembered state, and their keys are places in `wanted`.
-        Each entry of `wanted` holds the place of an effect, or None, and the name of a parameter.
+        An entry of `wanted` holds the place of an effect, or None, and the name of a parameter.
+        The keys of the result are places in `wanted`.
         """
         kept = self._known()
         columns: dict[int, Array] = {}

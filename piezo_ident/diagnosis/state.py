@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import functools
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.equations import Pull
-from piezo_ident.diagnosis.retuning import RETUNING
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.effects import Effect, find_effect
 from piezo_ident.effects.trials import number_of, with_number
@@ -25,6 +25,14 @@ from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
+#: corner frequencies of the relaxations in a retuned G [Hz]
+RELAXATIONS = (15.0, 100.0)
+#: bounds of the retuning: samples of delay, their squares, and two relaxations (approximate units)
+RETUNING = (20.0, 800.0, 1.0, 1.0)
+#: a retuned G follows its law up to this multiple of the highest driven frequency
+BEYOND = 4.0
+#: largest relative error of the product of G and its factor by rounding
+ROUNDING = 1e-4
 #: effect that continues after the motion has ended
 CREEP = 'creep'
 #: effect that resembles creep beside an H that is not a sum of plays
@@ -47,11 +55,7 @@ EARLIER_COST = 0.003
 
 @dataclass(frozen=True, eq=False)
 class Added:
-    """
-    Effect in the model under study, with its parameters in each record.
-
-    The parameters are the same in all records, unless the effect is driven by time.
-    """
+    """Effect under study, with its parameters in each record; only effects of time differ."""
 
     name: str
     values: tuple[Mapping[str, Any], ...]
@@ -90,11 +94,9 @@ class State:
     retuning : tuple of float
         Coefficients of `retuned`; empty if G stays unchanged.
     linear : (Dynamics, Delay) or None
-        G and the delay in the place of those of the model.
-    law : HysteresisLaw or None
-        The law of H; None if H stays fixed.
-    coefficients : ndarray, shape (size,)
-        Coefficients of H in its law.
+        Another G and delay than the model has.
+    law, coefficients : HysteresisLaw or None, ndarray, shape (size,)
+        The law of H, and H in this law; None if H stays fixed.
     fading : tuple of float
         Time constants of creep that continues in each record from earlier motion [s].
     earlier : ndarray, shape (records, times)
@@ -113,7 +115,7 @@ class State:
 
     @property
     def only_adds(self) -> Array:
-        """All amplitudes that only add to the displacement, shape (records (1 + times),)."""
+        """Amplitudes that only add to the displacement; shape (records (1 + times),)."""
         return np.concatenate([self.offsets, self.earlier.ravel()])
 
     def with_only_added(self, values: Array) -> State:
@@ -127,7 +129,7 @@ class State:
         return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
 
     def without(self, i: int) -> State:
-        """Return the state without an effect; without creep, earlier creep is removed, too."""
+        """Return the state without an effect; earlier creep leaves with creep."""
         rest = replace(self, effects=self.effects[:i] + self.effects[i + 1 :])
         return rest.from_rest() if self.effects[i].name == CREEP else rest
 
@@ -149,7 +151,7 @@ class FreeParameter:
     """
     One number that the fit may move, in one record or (None) in all records.
 
-    `effect` is the place of its effect in the state, or None for the retuning of G.
+    `effect` is the place of its effect in the state; the retuning of G has None.
     """
 
     effect: int | None
@@ -212,9 +214,8 @@ def free_parameters(
     """
     List every number of the retuning of G and of the effects that the fit may move.
 
-    H can imitate the first number of some effects (`first_stays`).  If H is free, this number
-    stays fixed in the record `longest`, so other records count relative to it.  If H is fixed,
-    `longest` is None and the number is free in all records.
+    A free H can imitate the first number of some effects (`first_stays`).  This number then stays
+    fixed in the record `longest`, and other records count relative to it.
     """
     found = [
         FreeParameter(None, None, 'retuning', i, False, 1e-3 * size, -size, size)
@@ -276,7 +277,7 @@ def moved(
 def prior_of(
     rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
 ) -> Array:
-    """Compute the prior of p numbers of a fit with residual e: what each must gain to move."""
+    """Compute the prior of p numbers of a fit with residual e: the price of moving each."""
     # neighbouring residuals are similar: a block counts as a few observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
     # curves and lags are nearly collinear: only large steps of them have an effect
@@ -293,8 +294,8 @@ def firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     """
     Strengthen the prior for parameters that only a left-out kind of excitation determines.
 
-    Example: only a multisine reaches a limit of the slew rate, so other motion leaves the limit
-    open.  Creep from earlier motion is determined by the motion at the start of a record alone.
+    Example: only a multisine reaches a limit of the slew rate.  Only the start of a record
+    determines creep from earlier motion.
     """
     firm = prior.copy()
     firm[places_of_decays(state)] += rows.n / FIRM
@@ -316,7 +317,7 @@ def cost_of_decays(rows: Rows) -> float:
 def with_known(
     state: State, parameters: Sequence[FreeParameter], prior: Array, pull: Pull | None
 ) -> Pull | None:
-    """Add to a pull the pull of numbers known to be small towards zero, weighted by `prior`."""
+    """Add to a pull the prior's pull of small numbers towards zero."""
     p = prior.size
     size = np.zeros(p)
     size[places_of_decays(state)] = state.earlier.ravel()
@@ -327,3 +328,55 @@ def with_known(
     if pull is None:
         return Pull(np.zeros((p, p)), b, s) if size.any() else None
     return Pull(pull.A, pull.b + b, pull.s + s)
+
+
+# -- G with a factor near one --------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=64)
+def retuning_factor(
+    retuning: tuple[float, ...], sample_rate: float, band: float = np.inf
+) -> Dynamics:
+    """
+    Compute the factor of G.
+
+    The factor is ``1 + c_1 D + c_2 D^2 + sum_j c_j (1 - z^-1) / (1 - p_j z^-1)`` with p_j the
+    poles of `RELAXATIONS`: a delay, a roll-off, and relaxations.  D is ``1 - z^-1`` up to the band
+    [Hz].  Beyond this band the data hold no motion, and D stays constant.  The factor is 1 at
+    rest, and c_1 acts like minus a delay in samples at low frequencies.
+    """
+    c1, c2, c3, c4 = retuning
+    D = np.array([1.0, -1.0])
+    p = float(np.exp(-2.0 * np.pi * band / sample_rate))
+    P, Q = (np.array([1.0, -np.exp(-2.0 * np.pi * f / sample_rate)]) for f in RELAXATIONS)
+    limited, B = (1.0 - p) * D, np.array([1.0, -p])
+    BB, PQ = np.convolve(B, B), np.convolve(P, Q)
+    terms = (
+        np.convolve(BB, PQ),
+        c1 * np.convolve(np.convolve(limited, B), PQ),
+        c2 * np.convolve(np.convolve(limited, limited), PQ),
+        c3 * np.convolve(np.convolve(Q, D), BB),
+        c4 * np.convolve(np.convolve(P, D), BB),
+    )
+    factor = np.sum([np.pad(term, (0, 5 - term.size)) for term in terms], axis=0)
+    return Dynamics(a=np.convolve(BB, PQ)[1:], b=factor)
+
+
+def retuned(
+    dynamics: Dynamics, retuning: Sequence[float], sample_rate: float, band: float = np.inf
+) -> Dynamics:
+    """
+    Multiply G by its factor; G alone if the product is unstable or loses digits.
+
+    The factor adds four poles near 1.  A G of high order at a high sampling rate leaves too few
+    digits for them.
+    """
+    if not any(retuning):
+        return dynamics
+    factor = retuning_factor(tuple(retuning), sample_rate, band)
+    a = np.convolve([1.0, *dynamics.a], [1.0, *factor.a])[1:]
+    product = Dynamics(a=a, b=np.convolve(dynamics.b, factor.b))
+    f = np.geomspace(1e-5, 0.4, 60) * sample_rate
+    exact = dynamics.response(f, sample_rate) * factor.response(f, sample_rate)
+    lost = np.abs(product.response(f, sample_rate) - exact).max() / np.abs(exact).max()
+    return product if lost < ROUNDING and product.is_stable else dynamics

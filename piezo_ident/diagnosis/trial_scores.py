@@ -62,38 +62,27 @@ class Scored:
     effect, trial
     coefficients : ndarray, shape (c,)
         Steps of the amplitudes, from the least-squares fit.
-    errors : ndarray, shape (blocks,)
-        Sum of squares of each block, held out in spread sets.
+    error : float
+        Sum of squares of all blocks, held out in spread sets.
     chance : float
         Largest decrease of the sum of squares of a surrogate.
     visible : float
         Share of its columns that the rest of the model cannot imitate.
     is_possible : bool
-        False if the data contradict the trial: an effect without amplitudes must be fitted with an
-        amplitude of about one.
+        Whether an effect that is either on or off is fitted with an amplitude of about one.
     """
 
     effect: type[Effect]
     trial: Trial
     coefficients: Array
-    errors: Array
+    error: float
     chance: float
     visible: float
     is_possible: bool = True
 
-    @property
-    def error(self) -> float:
-        """Sum of the held-out squares."""
-        return float(self.errors.sum())
-
 
 class TrialColumns:
-    """
-    Changes of the rows of one state through trials, computed once.
-
-    The columns of a small effect are the same beside a sum of plays and beside a wide H.  They
-    differ beside the H as given: the column of a backlash differs there enough to hide it.
-    """
+    """Changes of the rows of one state through trials, computed once for several fits of H."""
 
     def __init__(self, simulator: Simulator, state: State, lines: Sequence[float]) -> None:
         self.simulator, self.rows = simulator, simulator.rows
@@ -109,8 +98,8 @@ class TrialColumns:
         """
         Return the trials of an effect with the places of their columns, and all columns.
 
-        The columns have shape (n, c), one for a step of each amplitude.  An effect driven by time
-        has one column for each record.  A trial that cannot run on these data is left out.
+        The columns, shape (n, c), belong to a step of each amplitude, and of an effect of time in
+        each record.  A trial that cannot run on these data is left out.
         """
         if effect.name not in self._kept:
             self._kept[effect.name] = self._run(effect, tick)
@@ -170,11 +159,12 @@ def score_trials(
             theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[p:]
             visible = _visible(both, p, wide)
             if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
-                yield Scored(effect, trial, theta, known.s[:, 0], 0.0, visible, False)
+                whole_error = float(known.s[:, 0].sum())
+                yield Scored(effect, trial, theta, whole_error, 0.0, visible, False)
                 continue
             errors = held_out_errors(both, rows.fold, wide)
             chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
-            yield Scored(effect, trial, theta, errors[:, 0], chance, visible)
+            yield Scored(effect, trial, theta, float(errors[:, 0].sum()), chance, visible)
 
 
 def best_trials(
@@ -259,10 +249,9 @@ Place = tuple[Integers, Array]
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
-    Return whether the last added effect shows in its own places; True if it has no such place.
+    Return whether the last added effect shows, at a plausible size, in the places of its own.
 
-    The values of the effect must also be plausible.  `noise` is the mean square of the noise of a
-    row.
+    An effect without such places shows.  `noise` is the mean square of the noise of a row.
     """
     if fitted.name not in _PLACES:
         return True
@@ -304,12 +293,7 @@ def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:
 
 
 def _in_motion(rows: Rows, y: Array) -> Iterator[Place]:
-    """
-    Yield the rows of each run, and the columns of a gain that depends on the motion.
-
-    The columns are all quadratic functions of the local mean, size and speed of the command, and
-    the same functions times the displacement y.
-    """
+    """Yield the rows of each run, and columns of a gain by local mean, size and speed."""
     first = 0
     for run, keep in zip(rows.runs, rows.keep, strict=True):
         u = block_means(run.u, rows.m)

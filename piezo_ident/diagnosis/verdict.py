@@ -47,23 +47,19 @@ class Findings:
     Attributes
     ----------
     verdict : str
-    effects : tuple of str
-        Effects that were added, in order.
-    gains : tuple of float
-        The mean square that each effect explains.
+    effects, gains : tuple of str, tuple of float
+        Effects that were added, in order, and the mean square that each explains.
     group : Class or None
     explainable : float
-        Error to explain, a mean square: the error of the best H and G without an effect, or of the
-        model as given if an effect has set in.  With effects of tests of their own, it is at least
-        the error of the best H without them.
-    share : float
-        Share of the explainable error that everything added explains.
-    left : float
-        Error left beyond the noise, rms in % of stroke.
+        Error to explain, a mean square (`Decision.whole`).  With effects of tests of their own, at
+        least the error of the best H without them.
+    share, left : float
+        Share of the explainable error that everything added explains, and the error left beyond
+        the noise, rms in % of stroke.
     gain : OtherGain or None
         The other gain, if it explains the error as well as a refit of H.
     set_in : bool
-        Whether an effect has appeared since the identification.
+        Whether an effect has set in since the identification.
     """
 
     verdict: str
@@ -91,11 +87,10 @@ def judge(
     untried: Collection[str],
 ) -> Findings:
     """
-    Judge a decision.
+    Judge a decision, with the last step of the walk of H.
 
-    `last` is the last step of the walk of H.  `shown` holds effects that tests of their own have
-    shown; beside the best H the mean square error without them is `before`.  `untried` holds
-    effects that were no candidates.
+    Tests of their own have shown the effects `shown`; without them the mean square error of the
+    best H is `before`.  The effects `untried` were not among the candidates.
     """
     rows, best = candidates.rows, decision.best
     rest, whole = candidates.left_by(last.fitted), decision.whole
@@ -109,7 +104,8 @@ def judge(
         whole = max(whole, before - candidates.noise)
     share = float(np.clip(1.0 - rest / whole, 0.0, 1.0))
     if best is not None or shown:
-        effects = (*shown, *_in_order(decision))
+        own = () if best is None else (a.name for a in best.fitted.state.effects)
+        effects = (*shown, *(name for name in own if best and name in best.effects))
         group = _class(decision.names, untried, effects)
         verdict = 'class' if group else 'named'
         if candidates.is_part(rest, whole):
@@ -132,14 +128,6 @@ def judge(
         return Findings('refitted', (), (), group, whole, 0.0, left, gain)
     is_small = after < rows.square(SMALLEST_EFFECT) + 2.0 * candidates.least_share
     return Findings('none' if is_small else 'unexplained', (), (), None, whole, 0.0, left)
-
-
-def _in_order(decision: Decision) -> tuple[str, ...]:
-    """Return the effects of the best set in the order of its fit."""
-    best = decision.best
-    if best is None:
-        return ()
-    return tuple(a.name for a in best.fitted.state.effects if a.name in best.effects)
 
 
 def _gains(
@@ -197,13 +185,10 @@ def candidates_of(
             continue
         found.append(Candidate(name, share, _why_not(name, share, findings, rows.passes)))
     found.sort(key=lambda c: -c.share)
-    tried = {c.name for c in found}
-    speak = [
-        Candidate(name, 0.0, 'these data speak against it')
-        for name, share in seen.items()
-        if share >= SWALLOWED and name not in {*tried, *findings.effects}
-    ]
-    return (*found, *speak)
+    others = [name for name, share in seen.items() if share >= SWALLOWED]
+    told = {*findings.effects, *(c.name for c in found)}
+    why = 'these data speak against it'
+    return (*found, *(Candidate(name, 0.0, why) for name in others if name not in told))
 
 
 def _shares(candidates: Candidates, rounds: Sequence[Round]) -> dict[str, float]:
@@ -255,7 +240,7 @@ def smallest_detectable(candidates: Candidates, findings: Findings) -> float | N
     """
     Return the smallest size of a further effect that would be found, rms in % of stroke.
 
-    None if the voltage passed its range too rarely for any effect to be found.
+    A voltage that passes its range too rarely shows no effect: the result is then None.
     """
     if candidates.rows.passes < PASSES:
         return None

@@ -136,7 +136,7 @@ def test_a_retuned_g_is_a_change_of_g(given):
         ]
     )
     assert taken(some) == ('delay_change',)
-    assert decide(some).rivals == ()
+    assert decide(some).names == ()
 
 
 @pytest.mark.parametrize(('missed', 'names'), [(0.9, ('delay_change',)), (1.0, ())])
@@ -193,4 +193,4 @@ def test_what_takes_most_of_a_part_is_not_told_from_it(given, left, is_class):
     both = given.and_these([found('creep', left=one), found('gain_drift', left=other)])
     decision = decide(both)
     assert decision.best.effects == ('creep',)
-    assert decision.rivals == ((('gain_drift',),) if is_class else ())
+    assert decision.names == (('creep', 'gain_drift') if is_class else ())

@@ -28,10 +28,9 @@ from piezo_ident.diagnosis.base_residual import base_residual, prepared
 from piezo_ident.diagnosis.equations import held_out_errors, normal_equations
 from piezo_ident.diagnosis.joint_fit import base_at, fit_base, fit_jointly, Until
 from piezo_ident.diagnosis.refits import base_thresholds
-from piezo_ident.diagnosis.retuning import retuned
 from piezo_ident.diagnosis.rows import make_rows
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.state import Added, free_parameters, State
+from piezo_ident.diagnosis.state import Added, free_parameters, retuned, State
 from piezo_ident.effects import find_effect
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
