@@ -260,7 +260,7 @@ def test_a_sensor_that_hangs_is_no_noise(start, stop):
         y[start:stop] = bad
         broken = Record.from_arrays(piece.v, y, sample_rate=piece.sample_rate)
         simulator, faults = prepared(slow_model(), [without_faults(broken)])
-        floors.append(base_residual(simulator, faults.quantum).single ** 0.5)
+        floors.append(base_residual(simulator, faults).single ** 0.5)
     # where it hung for some periods, the residual repeats exactly; where it begins to, not at all
     assert floors[1] == pytest.approx(floors[0], rel=0.02)
 
