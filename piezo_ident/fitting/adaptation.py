@@ -52,8 +52,8 @@ Recalled: TypeAlias = Callable[[StageModel], Stream]
 GROUP = 2e-3
 #: time constant of the high-pass [s]: below it lie scans, above it drift and slow creep (taste)
 SLOW = 0.1
-#: time of motion after which a measurement counts by 1 / e [s]: a change shall be learnt within
-#: 10 s, which are more than five of these times
+#: time of motion after which a measurement counts by 1 / e [s].  A change shall be learnt within
+#: 10 s, more than five of these times
 MEMORY = 1.5
 #: time of refused measurements after which they are believed [s]: the high-pass has forgotten a
 #: step of the sensor by then
@@ -274,7 +274,7 @@ class Adaptation:
 
     def learn(self, y: Array, before: Array, new: Array) -> Array:
         """
-        Learn from normalised displacement; return what the learnt changes add to the free run.
+        Learn from normalised displacement; return the learnt correction of the free run.
 
         The rows of `before` and `new` are the free run and the responses, a horizon before and
         now; shapes (k, n).

@@ -4,11 +4,11 @@
 """
 Attribute the error of a running model to its gain, its loop width or its dynamics.
 
-Least squares fit the error of the free run by the response to a small change of each part of the
-model: the free run itself for the gain, the response to wider plays for the loop, the response to
-slower poles and the velocity for the dynamics.  A changed model runs for each of the middle two,
-so effects, G and delay act on the change as they act on the stage.  A high-pass removes offset,
-drift and creep of earlier motion, which an observer corrects.  Old samples fade.
+Least squares fit the error of the free run by the responses to small changes of the model.  A
+change of the gain adds the free run itself.  Wider plays stand for the loop.  Slower poles and
+the velocity stand for the dynamics.  A changed model runs for wider plays, and another for slower
+poles.  Effects, G and delay then act on these changes as they act on the stage.  A high-pass
+removes offset, drift and creep of earlier motion, which an observer corrects.  Old samples fade.
 
 The best part alone must explain most of the error.  Two parts are named if the best two leave much
 less than the best one, and three likewise.
@@ -84,7 +84,7 @@ def percent_change(value: float, std: float) -> str:
 
 
 def slower(model: StageModel) -> StageModel | None:
-    """Slow the poles of G by `SLOWER`; None if G has no pole that can be slowed."""
+    """Slow the poles of G by `SLOWER`; None if all are real and at most zero."""
     G = model.dynamics
     poles = G.poles
     # a pole on the negative real axis has no frequency
@@ -99,7 +99,7 @@ def slower(model: StageModel) -> StageModel | None:
 
 class Attribution:
     """
-    Finds what changed of a stage, from displacement that comes a horizon later.
+    Finds the changed parts of a stage from displacement that comes a horizon later.
 
     Parameters
     ----------

@@ -22,8 +22,8 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear, nnls
 
-#: share of the energy of a column that is added to the diagonal, so that rounding cannot make it
-#: negative: the products of double precision numbers keep single precision
+#: share of the energy of a column that is added to the diagonal, which rounding could make
+#: negative.  Products of double precision numbers keep single precision
 RIDGE = 1e-10
 #: largest violation of a row, a rounding error of slopes of about one, and most rows that one step
 #: may hold

@@ -6,7 +6,7 @@ Fit a stage by Gauss-Newton on the free-run error, inside bounds, with priors an
 
 Damping after D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
 doi:10.1137/0111030.  Each step solves one bounded least-squares problem for all parameters
-together.  It therefore finds the linear parameters, mainly the weights of H, exactly.
+together.  Each step therefore finds the linear parameters, mainly the weights of H, exactly.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from piezo_ident.fitting.equations import bounded_step, Equations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
-#: first damping, as a share of the energy of each column; its factors after a step that failed and
-#: after a step that helped; its smallest value; and the value at which the fit gives up
+#: damping as a share of the energy of each column: the first, its factors after a failed and after
+#: a good step, its smallest value, and the value that ends the fit
 DAMPING, WORSE, BETTER, LEAST, MOST = 1e-4, 5.0, 0.1, 1e-9, 1e6
 #: the fit ends if a step lowers the loss, or promises to, by less than this share
 SLOW = 1e-4

@@ -23,8 +23,8 @@ from piezo_ident.fitting.stage import Stage
 
 #: share of a step that a replicate takes: quantities are linearised, as the equations are
 SHARE = 0.1
-#: share of the energy of a column that is added to the diagonal: combinations of columns that the
-#: data tell less about do not move, in no replicate
+#: share of the energy of a column that is added to the diagonal.  Combinations of columns with
+#: less information in the data stay fixed in all replicates
 RIDGE = 1e-10
 
 
@@ -76,7 +76,7 @@ def deviations(values: Array, at: Array) -> Array:
     """
     Compute the deviations of the jackknife, shape (k,), from quantities of replicates.
 
-    The quantities have shape (blocks, k), and those of the fit itself, `at`, (k,).
+    The quantities have shape (blocks, k); `at` holds the quantities of the fit itself, shape (k,).
     """
     count = values.shape[0]
     if count < 2:

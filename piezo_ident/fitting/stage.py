@@ -8,13 +8,13 @@ Stage of one axis in a free-run fit: its parameters, its prediction, and the der
     w = h + sum_k s_k L_k h                              creep, L_k = 1 / (1 + tau_k p)
     y = B(z)/A(z) z^-d w + offset + sum_k s_k l_k exp(-t / tau_k)
 
-The parameters are c, s, a and b, the offset of each record, the lags l_k of creep at the first
-sample of each stretch, and the memory at the start of each record,
+The parameters are c, s, a, b and the offset of each record.  Each stretch adds the lags l_k of
+creep at its first sample.  Each record adds the memory at its start,
 
     F_r(0) = v(0) - int_0^r m(r') dr',      0 <= m <= 1,
 
 with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
-begins with m = 0 and l = 0, as a simulation does: free values of both would absorb errors of H.
+begins with m = 0 and l = 0, as a simulation does.  Free values would absorb errors of H.
 If `rested` is false, l is free there, too: a resting voltage does not exclude creep from before.
 
 With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
@@ -22,11 +22,11 @@ signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999),
 
 H rises with the voltage.  Right behind a turning point only its powers of v move.  Their slope is
 a quadratic in v.  The fit uses its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and
-t^2 with t from 0 to 1 over the span of the law, each at least `LEAST_SLOPE`.  With lags along the
-path the slope depends on the whole past.  It is still linear in c, and is held above
-`LEAST_SLOPE` on sweeps between any two of a few voltages.  A slope may already be smaller, because
-the gain of G that moves into H lowers it.  It may then stay: a step that had to raise it first
-could increase the loss, and the fit would end at its start.
+t^2, where t runs from 0 to 1 over the span of the law.  Each is at least `LEAST_SLOPE`. With lags
+along the path the slope depends on the whole past.  It is still linear in c, and is held above
+`LEAST_SLOPE` on sweeps between any two of a few voltages.  A slope may already be smaller,
+because the gain of G that moves into H lowers it.  Such a slope may stay.  A step that had to
+raise it could increase the loss, and the fit would end at its start.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ from piezo_ident.operators.play import play_columns
 RADIUS = 0.99999
 #: number of parts of the memory at a start (taste: a record tells only a few)
 PARTS = 6
-#: smallest slope of H behind a turning point, as a share of stroke over range; piezo ceramics have
-#: more than a third, and an inverse would jump at a slope of zero (taste)
+#: smallest slope of H behind a turning point, as a share of stroke over range (taste).  Piezo
+#: ceramics have more than a third.  An inverse would jump at a slope of zero
 LEAST_SLOPE = 0.05
 #: largest share of one element of creep: piezo ceramics creep by 1 to 5 % of a step in all
 MOST_CREEP = 0.1
-#: prior rms of the share of an element of creep, of a lag of creep as a share of the range, and of
-#: a share of the memory at a start around its first guess
+#: prior rms of an element of creep, of a lag of creep as a share of the range, and of a share of
+#: the memory at a start around its guess
 CREEP_SPREAD, LAG_SPREAD, START_SPREAD = 0.02, 0.5, 0.5
-#: prior rms of the density of H, prior rms of its change over the range, and prior rms of the
-#: change of the slope behind a turning point over the range.  The even density that makes the
-#: whole stroke is 2 (taste: a quarter of it, and a third of the mean slope)
+#: prior rms of the density of H, and of the changes over the range of this density and of the
+#: slope behind a turning point.  The even density that makes the whole stroke is 2 (taste:
+#: a quarter of it, and a third of the mean slope)
 DENSITY_SPREAD, DENSITY_CHANGE, SLOPE_CHANGE = 2.0, 0.5, 0.3
 #: step of the finite difference over a share of the memory
 STEP = 1e-3
@@ -238,7 +238,7 @@ class Stage:
         """
         Rows, shape (k, p), and the smallest product of each row and a step, for which H rises.
 
-        None without lags along the path, where `bounds` suffice.
+        None if the path has no lags: `bounds` then suffice.
         """
         if not self.law.lags:
             return None

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Everything in a loop model fitted at once by its error in free run.
+Fit all parameters of a loop model at once by its error in free run.
 
 Levenberg-Marquardt on the steady state of periodic records of all amplitudes together, with the
 sensitivities of `piezo_ident.model.modes.kernels`.  The error of each output of each record is
