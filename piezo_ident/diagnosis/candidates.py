@@ -103,12 +103,9 @@ class CandidateSearch:
         return candidates
 
     def _in_all_ways(self, candidates: Candidates, size: int) -> Candidates:
-        """
-        Fit the best sets of a size with all treatments of H and G.
-
-        A wide H may have absorbed an effect in part, and this H then errs under other motion.  A
-        sum of plays may leave an error that another effect fits by accident.
-        """
+        """Fit the best sets of a size with all treatments of H and G."""
+        # a wide H may have absorbed an effect in part and errs under other motion; a sum of plays
+        # may leave an error that another effect fits by accident
         sets = [s for s in candidates.sets if len(s) == size]
         for effects in sets[:IN_ALL_WAYS]:
             best = candidates.of(effects)[0]
@@ -215,11 +212,7 @@ def _best_h(candidates: Candidates) -> Candidate:
 
 
 def _worth_searching(candidates: Candidates) -> list[Candidate]:
-    """
-    Return the candidates beside which effects are sought: the given H and the best H.
-
-    The best candidate with a retuned G is added if its error is clearly smaller.
-    """
+    """List starts of a search: the given H, the best H, and a retuned G that errs clearly less."""
     best = _best_h(candidates)
     retuned = sorted((c for c in candidates.all if c.retunes), key=candidates.left)
     more = [c for c in retuned if ALIKE * candidates.left(c) <= candidates.left(best)]

@@ -157,7 +157,8 @@ class Candidates:
         given = min(self.left(c) for c in self.of((), effects) if c.way == 'given')
         if given - left < self.rows.square(SMALLEST_EFFECT):
             return False
-        for part in _parts(effects):
+        sizes = range(len(effects))
+        for part in (x for k in sizes for x in itertools.combinations(effects, k)):
             other = self.best(part, effects)
             if other is None:
                 continue
@@ -252,8 +253,8 @@ def decide(candidates: Candidates) -> Decision:
 def _set_in(candidates: Candidates) -> Decision:
     """Decide whether an effect has set in, if no set is admissible beside the best H."""
     found = candidates.like_refit()
-    # without labels the earlier error on other motion is unknown, and the H of any material has
-    # some loops that are not congruent from the beginning
+    # only labels tell the earlier error on other motion; the H of any material has some loops that
+    # were never congruent
     if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
         return Decision(None, candidates.left(candidates.without()))
     best = _simplest(candidates, found)
@@ -285,12 +286,6 @@ def _rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...]
 def change_g(effects: Sequence[str]) -> bool:
     """Return whether at least one of the effects changes G."""
     return any(find_effect(name).in_dynamics for name in effects)
-
-
-def _parts(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield all smaller sets of the same effects."""
-    for k in range(len(effects)):
-        yield from itertools.combinations(effects, k)
 
 
 def _narrower(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:

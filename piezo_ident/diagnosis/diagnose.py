@@ -64,7 +64,7 @@ def diagnose(
     *,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """Find what a model of one axis lacks; see `piezo_ident.diagnose`."""
+    """Find the effects that a model of one axis lacks; see `piezo_ident.diagnose`."""
     settings = DiagnosisSettings() if settings is None else settings
     records = records_of(records, 'diagnose, second argument')
     expect(model, StageModel, 'diagnose, first argument', 'read a model with load')
@@ -113,11 +113,8 @@ def diagnose(
 
 
 def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list[Record]:
-    """
-    Cut records to their beginnings, in proportion to their lengths, to `most` samples in total.
-
-    Creep and hysteresis depend on earlier motion, so a part must begin where the record begins.
-    """
+    """Cut records to their beginnings, in proportion to their lengths, to `most` samples."""
+    # creep and hysteresis depend on earlier motion, so a part begins where its record begins
     usable = [
         (record, [p for p in record if same_rate(p.sample_rate, model.sample_rate)])
         for record in records
@@ -253,7 +250,7 @@ def _residuals(
 ) -> tuple[Residual, ...]:
     """Compute the residuals of each piece as given, before, and after the refinement [m]."""
     runs, Y = simulator.rows.runs, simulator.model.scaling.Y
-    # a refit without effects has no model between the given and the refined one
+    # behind a refit without effects, the refined model is the model before effects, too
     is_refit = not refined.is_given and not refined.state.effects
     before = refined.state if is_refit else without
     full = [simulator.full(state) for state in (given, before, refined.state)]

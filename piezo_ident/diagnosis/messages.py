@@ -87,8 +87,8 @@ def warnings_of(simulator: Simulator, refined: Refined, floor: NoiseFloor) -> li
     ]
     for shift in refined.shifts[refined.shifts != 0.0]:
         found.append(
-            f'the zero of the displacement has moved by {1e6 * shift:.3g} um in a record; that is '
-            'no part of any error, and the refined model keeps the zero of the given one'
+            f'the zero of the displacement has moved by {1e6 * shift:.3g} um in a record; no '
+            'error counts this shift, and the refined model keeps the zero of the given one'
         )
     (low, high), (least, most) = refined.model.scaling.range, given.scaling.range
     if low > least or high < most:

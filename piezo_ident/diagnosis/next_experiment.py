@@ -57,11 +57,11 @@ def next_experiment(
     diagnosis: Diagnosis | None, records: Sequence[Record] = (), asked: Sequence[Kind] = ()
 ) -> Experiment | None:
     """
-    Return the experiment that answers an open question; None if no question or experiment is left.
+    Return the experiment that answers an open question; None after the last one.
 
     Found effects and effects that could not be separated come first, then untestable effects.
-    Without a diagnosis the data held no motion to judge.  A kind in `asked` is not suggested
-    again.
+    Pass None if the data held too little motion for a diagnosis.  A kind in `asked` is not
+    suggested again.
 
     >>> next_experiment(None).kind
     'sweeps'

@@ -37,8 +37,8 @@ from piezo_ident.diagnosis.state import RETUNING, State
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 
-#: a new numerator of G begins so many samples earlier, as the delay may have imitated the effect;
-#: its fewest taps (physics: a mode needs three, and a filter behind the mode needs one)
+#: a new numerator of G begins so many samples earlier, as the delay may have imitated the effect.
+#: Its fewest taps: a mode needs three, and a filter behind the mode needs one (physics)
 EARLIER, LEAST_TAPS = 3, 4
 #: laws of H that are wider than plays: one with loops that are not congruent, one with lags, too
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')

@@ -240,16 +240,8 @@ def make_rows(
     `bad` marks for each run samples that are not used.  Raises IdentificationError if no record
     has the sampling rate of the model, or if too few rows can be judged.
     """
-    runs = runs_of(records, model.sample_rate, model.scaling, SWEPT)
-    if not runs:
-        rates = sorted({p.sample_rate for record in records for p in record})
-        raise IdentificationError(
-            f'no record is sampled at the {model.sample_rate:g} Hz of the model (they have '
-            f'{", ".join(f"{r:g}" for r in rates)} Hz); record at that rate, or identify again'
-        )
+    runs = _sound_runs(model, records, bad)
     names = tuple(dict.fromkeys(run.record for run in runs))
-    for i, out in enumerate(bad or ()):
-        runs[i] = replace(runs[i], use=runs[i].use & ~out, known=runs[i].known & ~out)
     at_rest = [begins_at_rest(model, run.piece, run.use) for run in runs]
     for i, run in enumerate(runs):
         if not at_rest[i]:
@@ -294,6 +286,22 @@ def make_rows(
         labels=group_labels,
         stroke=max(strokes((run.record, run.x[run.use]) for run in runs).values()),
     )
+
+
+def _sound_runs(
+    model: StageModel, records: Sequence[Record], bad: Sequence[Mask] | None
+) -> list[Run]:
+    """Return the runs at the sampling rate of a model, without their bad samples."""
+    runs = runs_of(records, model.sample_rate, model.scaling, SWEPT)
+    if not runs:
+        rates = sorted({p.sample_rate for record in records for p in record})
+        raise IdentificationError(
+            f'no record is sampled at the {model.sample_rate:g} Hz of the model (they have '
+            f'{", ".join(f"{r:g}" for r in rates)} Hz); record at that rate, or identify again'
+        )
+    for i, out in enumerate(bad or ()):
+        runs[i] = replace(runs[i], use=runs[i].use & ~out, known=runs[i].known & ~out)
+    return runs
 
 
 def _has_clock(model: StageModel) -> bool:

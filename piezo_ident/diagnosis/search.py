@@ -252,7 +252,7 @@ class _JointFits:
         return fit_jointly(own, state, self._before.base, until=until, tick=tick)
 
     def to_the_end(self, begun: Sequence[_Begun]) -> list[Fitted]:
-        """Fit the best candidates to the end; return all that show, the best first."""
+        """Fit the best candidates to the end; return the candidates that show, the best first."""
         found = [fitted for fitted, _ in begun]
         gains = [self._before.mean_square - _error(one) for one in found]
         # a few iterations cannot rank two candidates with nearly equal errors

@@ -13,10 +13,10 @@ one multisine of each amplitude that is held out:
 - ``softening``: stiffness that follows the level of the extension;
 - ``softening and plays``: softening, and plays of extension and voltage inside the loop.
 
-What sits inside the loop moves the modes with the amplitude; what sits in front changes the gain
-alone.  `loop_hysteresis` is therefore named only if linear models of each amplitude err clearly
-less with modes of their own than with those of all.  Without this test, a law with more signals
-may fit a hysteresis of the voltages better than plays in front do.
+Hysteresis inside the loop moves the modes with the amplitude.  Hysteresis in front of the
+mechanics changes the gain alone.  `loop_hysteresis` is therefore named only if linear models of
+each amplitude err clearly less with modes of their own than with those of all.  Without this
+test, a law with more signals may fit a hysteresis of the voltages better than plays in front do.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def find_shared_modes(
     """
     Find hysteresis inside the loop of shared modes, if chains err more without it.
 
-    The result is None if it is not found, or the records do not hold what it needs: multisines of
-    all axes at once, at two amplitudes, of two realisations each.
+    The records must hold multisines of all axes at once, at two amplitudes, of two realisations
+    each.  The result is None for other records, and for a stage free of such hysteresis.
     """
     if axes_of(records) != tuple(sorted(chains.axes)):
         return None
@@ -98,7 +98,7 @@ def find_shared_modes(
         alike = max(map(likeness, parts)) > ONE_SIGNAL
         found = None if alike else _found(chains, every, v0, progress)
     except (DataError, IdentificationError):
-        # the lines do not tell the axes apart, or determine no order
+        # the lines leave the axes or the order of the model open
         return None
     return found and found._replace(modes=_placed(found.modes, records))
 
@@ -179,7 +179,7 @@ class LawSearch:
         self.linear = loop_fit(self.plain, self._few, iterations=STEPS)
 
     def _grown(self, modes: SharedModes, still: Sequence[int] = ()) -> SharedModes:
-        """Fit how new signals push, then what they are."""
+        """Fit the effect of new signals alone, then the signals, too."""
         pushes = loop_fit(modes, self._few, hold=('f', 'g', 'mu'), still=still, iterations=2)
         return loop_fit(pushes, self._few, still=still, iterations=STEPS)
 

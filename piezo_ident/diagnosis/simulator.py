@@ -238,8 +238,9 @@ class Simulator:
         """
         Compute the difference of the rows of each state from the rows of the remembered state.
 
-        Each state differs in one place, an effect or (None) the factor of G, in one record or
-        (None) in all.  The chain runs from this place on.  A state that cannot run has None.
+        Each state differs in one place: an effect, or the factor of G (None).  It differs in one
+        record, or in all (None).  The chain runs from this place on.  A state that cannot run has
+        None.
         """
         chains, runs = self._known().chains, range(len(self._sources))
 
@@ -257,8 +258,12 @@ class Simulator:
         parts = list(self._pool.map(of_run, [(*change, i) for change in changes for i in runs]))
         found: list[Array | None] = []
         for k in range(0, len(parts), len(runs)):
-            known = [part for part in parts[k : k + len(runs)] if part is not None]
-            found.append(self._joined(known) if len(known) == len(runs) else None)
+            kept = [
+                part[keep]
+                for part, keep in zip(parts[k : k + len(runs)], self.rows.keep, strict=True)
+                if part is not None
+            ]
+            found.append(np.concatenate(kept) if len(kept) == len(runs) else None)
         return found
 
     def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
@@ -325,14 +330,6 @@ class Simulator:
 
     def _predicted(self, state: State, outputs: Sequence[Array]) -> Array:
         return self.rows.of(outputs) + self.added_columns(state) @ state.only_adds
-
-    def _joined(self, parts: Sequence[Array]) -> Array:
-        """Join the rows that count from all rows of each run, shape (n // m,) or (k, n // m)."""
-        kept = [
-            part if keep.all() else part[..., keep]
-            for part, keep in zip(parts, self.rows.keep, strict=True)
-        ]
-        return kept[0] if len(kept) == 1 else np.concatenate(kept, axis=-1)
 
     def _chain(self, state: State, i: int) -> RunChain:
         alone = replace(state, retuning=())
