@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from piezo_ident.diagnosis.base_residual import BaseResidual
 from piezo_ident.diagnosis.criteria import ALIKE, LITTLE, RIVALS, SMALLEST_EFFECT, TAKES
-from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
+from piezo_ident.diagnosis.decision import Candidates, change_g, FittedSet
 from piezo_ident.diagnosis.earlier_motion import with_earlier_motion
 from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, tried
 from piezo_ident.diagnosis.refits import law_of, refit_of, with_g
@@ -114,7 +114,7 @@ class CandidateSearch:
             candidates = candidates.and_these(self._other_ways(candidates, best, goal))
         return candidates
 
-    def _other_ways(self, candidates: Candidates, best: Candidate, goal: float) -> list[Candidate]:
+    def _other_ways(self, candidates: Candidates, best: FittedSet, goal: float) -> list[FittedSet]:
         """Fit the set of a candidate with all other treatments of H, and then with a retuned G."""
         simulator, have = self._simulator, {c.way for c in candidates.of(best.effects)}
         state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
@@ -144,7 +144,7 @@ class CandidateSearch:
         if plays.state.effects != wide.state.effects:
             plays = refit_of(simulator, state, 'plays')
         named = {'given': given, 'plays': plays, 'wide': wide}
-        found = [Candidate((), way, fitted) for way, fitted in named.items()]
+        found = [FittedSet((), way, fitted) for way, fitted in named.items()]
         if simulator.is_fast:
             found += [replace(found[i], fitted=with_g(simulator, found[i].fitted)) for i in (0, 2)]
         return Candidates(
@@ -152,8 +152,8 @@ class CandidateSearch:
         )
 
     def _with_each(
-        self, base: Candidate, some: Sequence[type[Effect]], goal: float
-    ) -> list[Candidate]:
+        self, base: FittedSet, some: Sequence[type[Effect]], goal: float
+    ) -> list[FittedSet]:
         """Fit candidates with one more effect; each must promise an error below `goal`."""
         effects = [
             effect
@@ -163,12 +163,12 @@ class CandidateSearch:
         this = self._round(base.fitted, effects, goal)
         self.rounds.append(this)
         return [
-            Candidate(tuple(sorted((*base.effects, fitted.name))), base.way, fitted, this)
+            FittedSet(tuple(sorted((*base.effects, fitted.name))), base.way, fitted, this)
             # creep from earlier motion shows only beside the effect that was missing
             for fitted in (with_earlier_motion(self._simulator, one) for one in this.contenders)
         ]
 
-    def _worth_extending(self, candidates: Candidates, size: int) -> list[Candidate]:
+    def _worth_extending(self, candidates: Candidates, size: int) -> list[FittedSet]:
         """Return the best sets of a size to which one more effect is added."""
         sets = [s for s in candidates.sets if len(s) == size]
         bests = [c for c in map(candidates.best, sets) if c is not None]
@@ -206,12 +206,12 @@ class CandidateSearch:
         )
 
 
-def _best_h(candidates: Candidates) -> Candidate:
+def _best_h(candidates: Candidates) -> FittedSet:
     """Return the candidate with the H that leaves the smallest error with an unchanged G."""
     return min((c for c in candidates.all if not c.retunes), key=candidates.left)
 
 
-def _worth_searching(candidates: Candidates) -> list[Candidate]:
+def _worth_searching(candidates: Candidates) -> list[FittedSet]:
     """List starts of a search: the given H, the best H, and a retuned G that errs clearly less."""
     best = _best_h(candidates)
     retuned = sorted((c for c in candidates.all if c.retunes), key=candidates.left)

@@ -50,7 +50,7 @@ OF_MATERIALS = 'noncongruent_minor_loops'
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class FittedSet:
     """
     A set of effects beside one treatment of H and G, fitted.
 
@@ -86,9 +86,9 @@ class Candidates:
     rows: Rows
     noise: float
     missed: float
-    all: tuple[Candidate, ...]
+    all: tuple[FittedSet, ...]
 
-    def and_these(self, more: Sequence[Candidate]) -> Candidates:
+    def and_these(self, more: Sequence[FittedSet]) -> Candidates:
         """Return these candidates and more."""
         return replace(self, all=(*self.all, *more))
 
@@ -97,7 +97,7 @@ class Candidates:
         """Part of the noise that is added to each error, a mean square."""
         return NOISE_SHARE * self.noise
 
-    def left(self, candidate: Candidate) -> float:
+    def left(self, candidate: FittedSet) -> float:
         """Compute the error of a candidate beyond the noise, a mean square."""
         return self.left_by(candidate.fitted)
 
@@ -118,7 +118,7 @@ class Candidates:
         """Return whether an error is a large part of a whole, and as large as an effect."""
         return left > LITTLE * whole and self.percent(left) >= SMALLEST_EFFECT
 
-    def of(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> tuple[Candidate, ...]:
+    def of(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> tuple[FittedSet, ...]:
         """
         Return the candidates of a set, the best first.
 
@@ -130,11 +130,11 @@ class Candidates:
             some = [c for c in some if not c.retunes]
         return tuple(sorted(some, key=self.left))
 
-    def best(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> Candidate | None:
+    def best(self, effects: tuple[str, ...], beside: tuple[str, ...] = ()) -> FittedSet | None:
         """Return the best candidate of a set; see `of`."""
         return next(iter(self.of(effects, beside)), None)
 
-    def without(self, beside: tuple[str, ...] = ()) -> Candidate:
+    def without(self, beside: tuple[str, ...] = ()) -> FittedSet:
         """Return the best candidate without an effect; see `of`."""
         return self.of((), beside)[0]
 
@@ -192,7 +192,7 @@ class Candidates:
         return found
 
     @property
-    def as_given(self) -> Candidate:
+    def as_given(self) -> FittedSet:
         """The model as it was given."""
         return next(c for c in self.of(()) if c.way == 'given' and not c.retunes)
 
@@ -201,7 +201,7 @@ class Candidates:
         """Error of the model as it was given."""
         return self.left(self.as_given)
 
-    def like_refit(self) -> tuple[Candidate, ...]:
+    def like_refit(self) -> tuple[FittedSet, ...]:
         """Return the effects of the path that do most of the work of a refit; the best first."""
         given, refit = self.given, self.left(self.without())
         if given - refit < self.rows.square(SMALLEST_EFFECT) or self.rows.passes < PASSES:
@@ -219,7 +219,7 @@ class Decision:
 
     Attributes
     ----------
-    best : Candidate or None
+    best : FittedSet or None
         The candidate that was taken, if an effect was found.
     whole : float
         Error to explain, a mean square: the error of the best H and G without an effect.  For an
@@ -230,7 +230,7 @@ class Decision:
         Whether an effect has set in since the identification.
     """
 
-    best: Candidate | None
+    best: FittedSet | None
     whole: float
     names: tuple[str, ...] = ()
     set_in: bool = False
@@ -264,14 +264,14 @@ def _set_in(candidates: Candidates) -> Decision:
     return Decision(best, candidates.given, names, set_in=True)
 
 
-def _simplest(candidates: Candidates, some: Sequence[Candidate]) -> Candidate:
+def _simplest(candidates: Candidates, some: Sequence[FittedSet]) -> FittedSet:
     """Return the candidate with the fewest parameters among those about as good as the best."""
     least = min(map(candidates.left, some))
     alike = [c for c in some if candidates.left(c) <= ALIKE * least]
     return min(alike, key=lambda c: (c.size, candidates.left(c)))
 
 
-def _rivals_of(candidates: Candidates, best: Candidate) -> tuple[tuple[str, ...], ...]:
+def _rivals_of(candidates: Candidates, best: FittedSet) -> tuple[tuple[str, ...], ...]:
     """Return the sets of equal size that are not separated from the best set, by their errors."""
     left, whole = candidates.left(best), candidates.left(candidates.without(best.effects))
     most = RIVALS * left
@@ -295,7 +295,7 @@ def _narrower(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
             yield tuple(sorted({*effects, other} - {name}))
 
 
-def _beyond_chance(candidate: Candidate) -> bool:
+def _beyond_chance(candidate: FittedSet) -> bool:
     """Return whether the effect found last gains more than on surrogates of the residual."""
     found, fitted = candidate.found_in, candidate.fitted
     # an effect that only depends on time fits a shifted residual equally well

@@ -33,7 +33,7 @@ from piezo_ident.diagnosis.messages import (
     warnings_of,
 )
 from piezo_ident.diagnosis.refined_model import found_effects, refine, Refined
-from piezo_ident.diagnosis.refits import law_of, Step, walk, with_numerator
+from piezo_ident.diagnosis.refits import law_of, walk, WalkStep, with_numerator
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings, Errors, Residual
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Simulator
@@ -179,7 +179,7 @@ def _result(
     rounds: Sequence[Round],
     candidates: Candidates,
     findings: Findings,
-    last: Step,
+    last: WalkStep,
     settings: DiagnosisSettings,
 ) -> Diagnosis:
     """Report the findings, without a sentence."""

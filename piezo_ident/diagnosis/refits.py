@@ -20,7 +20,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
-from piezo_ident.diagnosis.decision import Candidate, Candidates, change_g
+from piezo_ident.diagnosis.decision import Candidates, change_g, FittedSet
 from piezo_ident.diagnosis.equations import BaseColumns, held_out_errors, normal_equations, Pull
 from piezo_ident.diagnosis.joint_fit import (
     fit_base,
@@ -45,7 +45,7 @@ WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class WalkStep:
     """
     One H of the walk: 'given', 'gain', 'plays', 'drawn' (wide, towards the given H) or 'wide'.
 
@@ -89,9 +89,9 @@ def walk(
     simulator: Simulator,
     given: State,
     candidates: Candidates,
-    best: Candidate | None,
+    best: FittedSet | None,
     tick: Callable[[], None],
-) -> Step:
+) -> WalkStep:
     """Choose the H of the refined model, beside the effects of the best candidate."""
 
     def goal() -> float:
@@ -126,10 +126,10 @@ def _steps(
     simulator: Simulator,
     given: State,
     candidates: Candidates,
-    best: Candidate | None,
+    best: FittedSet | None,
     tick: Callable[[], None],
     goal: Callable[[], float],
-) -> Iterator[Step]:
+) -> Iterator[WalkStep]:
     """Yield one H after the other; `goal` as in `Until`.  A fit that runs away ends the walk."""
     # the best candidate of each treatment comes last, so it stays in the dictionary
     own = candidates.of(() if best is None else best.effects)[::-1]
@@ -141,15 +141,15 @@ def _steps(
         beside = known.get('given') or tried(fit_jointly, simulator, state)
         if beside is None:
             # beside the given H the effect runs away, so the H of the candidate stays
-            yield Step(best.way, best.fitted)
+            yield WalkStep(best.way, best.fitted)
             return
         first = beside
-    yield Step('given', first)
+    yield WalkStep('given', first)
     plays = known.get('plays') or tried(refit_of, simulator, first.state, 'plays', goal())
     if plays is None:
         return
-    yield Step('plays', plays)
-    yield from (Step(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
+    yield WalkStep('plays', plays)
+    yield from (WalkStep(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
     of_law: dict[LawName, Fitted | None] = {}
     if 'wide' in known:
         of_law[law_of(known['wide'])] = known['wide']
@@ -168,10 +168,10 @@ def _steps(
         if drawn is None:
             return
         if drawn is not wide:
-            yield Step('drawn', drawn)
+            yield WalkStep('drawn', drawn)
         laws = WIDE[:1]
     wides = [wide for name in laws if (wide := wide_of(name, goal())) is not None]
-    yield from (Step('wide', wide) for wide in wides)
+    yield from (WalkStep('wide', wide) for wide in wides)
     wide = min(wides, key=partial(_left, candidates), default=None)
     # an effect that changes G leaves nothing for a retuning of G
     if wide and simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
@@ -179,10 +179,10 @@ def _steps(
         if last is None or law_of(last) != law_of(wide):
             last = tried(with_g, simulator, wide)
         if last is not None:
-            yield Step('wide', last)
+            yield WalkStep('wide', last)
 
 
-def with_numerator(simulator: Simulator, step: Step) -> Step:
+def with_numerator(simulator: Simulator, step: WalkStep) -> WalkStep:
     """
     Fit the numerator of G again, in turn with all else, beside an effect that moves a mode of G.
 
@@ -235,7 +235,7 @@ def law_of(fitted: Fitted) -> LawName:
     return 'any' if fitted.state.law is None else fitted.state.law.name
 
 
-def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
+def _other_gain(simulator: Simulator, fitted: Fitted) -> WalkStep:
     """Fit another gain of an otherwise unchanged H."""
     rows, state = simulator.rows, fitted.state
     x = simulator.bare(state)
@@ -252,7 +252,7 @@ def _other_gain(simulator: Simulator, fitted: Fitted) -> Step:
     moved = replace(moved, offsets=moved.offsets + shifts)
     own, kinds = (held_out_errors(equations, x, none)[:, 0] for x in (rows.fold, rows.group))
     step = Fitted(moved, base, e, np.empty((rows.n, 0)), free, (), none, own, kinds)
-    return Step('gain', step, gain)
+    return WalkStep('gain', step, gain)
 
 
 #: number of samples of a sweep over the range

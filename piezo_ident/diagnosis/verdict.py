@@ -23,10 +23,9 @@ from piezo_ident.diagnosis.criteria import (
     SWALLOWED,
     TAKES,
 )
-from piezo_ident.diagnosis.decision import Candidate as Fit
-from piezo_ident.diagnosis.decision import Candidates, Decision
+from piezo_ident.diagnosis.decision import Candidates, Decision, FittedSet
 from piezo_ident.diagnosis.next_experiment import look_alikes, separating_experiment
-from piezo_ident.diagnosis.refits import Step
+from piezo_ident.diagnosis.refits import WalkStep
 from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
@@ -81,7 +80,7 @@ class Findings:
 def judge(
     candidates: Candidates,
     decision: Decision,
-    last: Step,
+    last: WalkStep,
     shown: tuple[str, ...],
     before: float,
     untried: Collection[str],
@@ -131,7 +130,7 @@ def judge(
 
 
 def _gains(
-    candidates: Candidates, best: Fit, effects: Sequence[str], whole: float
+    candidates: Candidates, best: FittedSet, effects: Sequence[str], whole: float
 ) -> Iterator[float]:
     """Yield the mean square that each effect of the best set explains beside the others."""
     for name in effects:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.diagnosis import criteria
-from piezo_ident.diagnosis.decision import Candidate, Candidates, decide
+from piezo_ident.diagnosis.decision import Candidates, decide, FittedSet
 import pytest
 
 N, NOISE = 4000, 1e-8
@@ -33,12 +33,12 @@ def found(*names, left, way='wide', chance=0.0, before=WHOLE, **how):
     """Return a candidate with some effects."""
     this = SimpleNamespace(before=fit(before), chance={names[-1]: chance})
     own = fit(left, name=names[-1], **how)
-    return Candidate(tuple(sorted(names)), way, own, this)
+    return FittedSet(tuple(sorted(names)), way, own, this)
 
 
 def without(left=WHOLE, way='wide', **how):
     """Return a candidate without effects."""
-    return Candidate((), way, fit(left, **how))
+    return FittedSet((), way, fit(left, **how))
 
 
 @pytest.fixture

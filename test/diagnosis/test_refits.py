@@ -13,7 +13,7 @@ from piezo_ident.diagnosis import refits as refits_module
 from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.equations import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
-from piezo_ident.diagnosis.refits import loops, refits, Step, toward_given, with_numerator
+from piezo_ident.diagnosis.refits import loops, refits, toward_given, WalkStep, with_numerator
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import centred, make_rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -150,7 +150,7 @@ def test_a_failed_fit_of_the_numerator_keeps_the_step(monkeypatch):
 
     monkeypatch.setattr(refits_module, '_with_other_numerator', fails)
     spring = Added('loop_hysteresis', ({'frequency': 300.0, 'damping': 0.03},))
-    step = Step(
+    step = WalkStep(
         'plays', SimpleNamespace(state=SimpleNamespace(effects=(CREEP, spring)), mean_square=1.0)
     )
     model = slow_model()
