@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
-from piezo_ident.control.linear_inverse import LONGEST, OUTSIDE, REACH, ROUNDING, SHORTEST
+from piezo_ident.control.linear_inverse import cut, LONGEST, reach_of, SHORTEST
 from piezo_ident.model.modes.modal import Modal
 from scipy.signal import oaconvolve
 
@@ -39,9 +39,7 @@ class AxesFilter(NamedTuple):
     @property
     def reach(self) -> int:
         """Distance beyond which a sample matters less than `REACH`."""
-        size = np.cumsum(np.abs(self.taps).sum(axis=(1, 2)))
-        first, last = np.searchsorted(size, size[-1] * np.array([REACH, 1.0 - REACH]))
-        return int(max(self.ahead - first, last - self.ahead, 0))
+        return reach_of(_size(self.taps), self.ahead)
 
     def __call__(self, x: Array) -> Array:
         """Filter signals of shape (n, inputs) that rest before and after their samples."""
@@ -94,20 +92,20 @@ def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, A
         back = whole.conj().swapaxes(1, 2)
         Q = np.linalg.solve(back @ whole + least**2 * np.eye(len(spans)), back)
         taps = [np.roll(np.fft.irfft(x, n, axis=0), n // 2, axis=0) for x in (Q, whole @ Q)]
-        size = np.abs(taps[0]).sum(axis=(1, 2))
-        before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
-        # an empty half proves that nothing wrapped around
-        last, left = left, float(before[n // 4] + after[-(n // 4)]) / float(before[-1])
-        if left < OUTSIDE or 0.5 * last < left < ROUNDING:
-            share = 0.5 * max(OUTSIDE, 4.0 * left) * float(before[-1])
-            start = min(int(np.searchsorted(before, share)), n // 2)
-            stop = max(n - int(np.searchsorted(after[::-1], share)), n // 2 + 1)
-            cut = [x[start:stop] @ np.linalg.inv(x[start:stop].sum(axis=0)) for x in taps]
-            of_spans = np.linalg.inv(static) @ cut[0] / spans, spans[:, None] * cut[1] / spans
-            inverse, passed = (AxesFilter(x, n // 2 - start, stop - 1 - n // 2) for x in of_spans)
+        left, enough = cut(_size(taps[0]), left)
+        if enough is not None:
+            parts = [x[enough.used] for x in taps]
+            q, p = (x @ np.linalg.inv(x.sum(axis=0)) for x in parts)
+            of_spans = np.linalg.inv(static) @ q / spans, spans[:, None] * p / spans
+            inverse, passed = (AxesFilter(x, enough.ahead, enough.behind) for x in of_spans)
             return inverse, passed
         n *= 2
     raise ModelError(
         f'these modes have no inverse of less than {LONGEST} samples: a zero of theirs dies away '
         'too slowly; diagnose again with longer periods'
     )
+
+
+def _size(taps: Array) -> Array:
+    """Add the sizes of the taps of all paths, shape (n,)."""
+    return np.asarray(np.abs(taps).sum(axis=(1, 2)))

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +78,7 @@ class LinearInverse:
     @property
     def reach(self) -> int:
         """Distance beyond which a sample of the wanted motion matters less than `REACH`."""
-        size = np.cumsum(np.abs(self.taps))
-        first, last = np.searchsorted(size, size[-1] * np.array([REACH, 1.0 - REACH]))
-        return int(max(self.ahead - first, last - self.ahead, 0))
+        return reach_of(np.abs(self.taps), self.ahead)
 
     def shortened(self, most: int) -> LinearInverse:
         """Limit the samples ahead to `most`; the static gain stays."""
@@ -94,6 +93,51 @@ class LinearInverse:
         """Filter a signal of shape (n,) that rests before and after its samples."""
         padded = np.pad(x, (self.behind, self.ahead), mode='edge')
         return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
+
+
+def reach_of(size: Array, ahead: int) -> int:
+    """Compute the reach of a filter from the sizes of its taps, of which `ahead` come first."""
+    total = np.cumsum(size)
+    first, last = np.searchsorted(total, total[-1] * np.array([REACH, 1.0 - REACH]))
+    return int(max(ahead - first, last - ahead, 0))
+
+
+class Cut(NamedTuple):
+    """The taps of a filter that count, `used`, and the samples that these need."""
+
+    used: slice
+    ahead: int
+    behind: int
+
+
+def cut(size: Array, last: float) -> tuple[float, Cut | None]:
+    """
+    Cut off the ends of a filter.
+
+    Parameters
+    ----------
+    size : ndarray, shape (n,)
+        Sizes of the taps; the middle one belongs to the present sample.
+    last : float
+        Share of the ends in a filter half as long.
+
+    Returns
+    -------
+    left : float
+        Share of the ends: the outer quarters.  Empty ends prove that nothing wrapped around.
+    cut : Cut or None
+        None if the filter is too short.
+    """
+    n = len(size)
+    before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
+    left = float(before[n // 4] + after[-(n // 4)]) / float(before[-1])
+    # close poles cost digits, which a longer filter does not bring back
+    if not (left < OUTSIDE or 0.5 * last < left < ROUNDING):
+        return left, None
+    share = 0.5 * max(OUTSIDE, 4.0 * left) * float(before[-1])
+    start = min(int(np.searchsorted(before, share)), n // 2)
+    stop = max(n - int(np.searchsorted(after[::-1], share)), n // 2 + 1)
+    return left, Cut(slice(start, stop), n // 2 - start, stop - 1 - n // 2)
 
 
 def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInverse:
@@ -126,18 +170,11 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
         G = _response(model, n)
         Q = np.conj(G) / (np.abs(G) ** 2 + (least_gain(model) * np.abs(G[0])) ** 2)
         taps = np.roll(np.fft.irfft(Q, n), n // 2)
-        size = np.abs(taps)
-        before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
-        # an empty half proves that nothing wrapped around
-        last, left = left, float(before[n // 4] + after[-(n // 4)]) / float(before[-1])
-        # close poles cost digits, which a longer filter does not bring back
-        if left < OUTSIDE or 0.5 * last < left < ROUNDING:
-            share = 0.5 * max(OUTSIDE, 4.0 * left) * float(before[-1])
-            start = min(int(np.searchsorted(before, share)), n // 2)
-            stop = max(n - int(np.searchsorted(after[::-1], share)), n // 2 + 1)
-            cut = taps[start:stop]
+        left, enough = cut(np.abs(taps), left)
+        if enough is not None:
+            part = taps[enough.used]
             # static gain of the model without effects, whose share is small
-            return LinearInverse(cut / (cut.sum() * G[0].real), n // 2 - start, stop - 1 - n // 2)
+            return LinearInverse(part / (part.sum() * G[0].real), enough.ahead, enough.behind)
         n *= 2
     faster = model.dynamics.without_slow_poles(
         SLOW * model.sample_rate / LONGEST, model.sample_rate
