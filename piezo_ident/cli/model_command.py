@@ -104,7 +104,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
             others = {axis: made[axis] for axis in unknown}
             pieces |= others
             if args.interval:
-                halves |= bands(model, record, others, args.interval)
+                made_bands = bands(model, record, made, args.interval)
+                halves |= {axis: made_bands[axis] for axis in unknown}
         unsure = [text for axis in others for text in unknown_parts(halves.get(axis, ()))]
         warnings = (*prediction_doubts(model, record), *unsure)
         lacks = f'displacement of {", ".join(unknown)}' if known else 'displacement'

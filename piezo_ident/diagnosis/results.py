@@ -304,6 +304,11 @@ class Diagnosis(Showable):
         return {name: getattr(self, name).overall for name in ('before', 'refit', 'after')}
 
     @property
+    def stroke(self) -> float:
+        """Largest stroke of the records [m]."""
+        return max(float(np.ptp(r.piece.y[r.sound])) for r in self.residuals if r.sound.any())
+
+    @property
     def changes(self) -> tuple[str, ...]:
         """Changes from the given to the refined model in words."""
         return changes(self.given, self.model)

@@ -44,9 +44,8 @@ def half_widths(
     return tuple(found)
 
 
-def with_interval(model: StageModel, run: FreeRun, level: float) -> FreeRun:
-    """Add the band to a free run, and a warning where nothing is known."""
-    half = half_widths(model, run.record, run.pieces, level, run.estimated)
+def with_half_widths(run: FreeRun, level: float, half: tuple[Array, ...]) -> FreeRun:
+    """Add half widths [m] to a free run, and a warning where nothing is known."""
     warnings = [f'{run.record.name}: {text}' for text in unknown_parts(half)]
     return replace(run, interval=level, half_widths=half, warnings=(*run.warnings, *warnings))
 

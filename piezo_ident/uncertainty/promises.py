@@ -17,6 +17,7 @@ come from.  The zero of the sensor does not count where it has clearly moved.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 import math
 
@@ -25,7 +26,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.criteria import MOVED_ZERO
 from piezo_ident.diagnosis.held_out import stretches
 from piezo_ident.diagnosis.messages import sentence
-from piezo_ident.diagnosis.results import Diagnosis, Errors
+from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.model.initial_memory import fit_start
 from piezo_ident.model.metrics import percent
@@ -58,11 +59,10 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     """Add weights, promise and band to a diagnosis, and the promise to its sentence."""
     model = result.model
     result = replace(result, weights=weights_of(result.errors_of_sets, len(result.kinds)))
-    stroke = max(float(np.ptp(r.piece.y[r.sound])) for r in result.residuals if r.sound.any())
-    runs = _elsewhere(result)
+    runs, stroke = _elsewhere(result), result.stroke
     same, other = (
-        blocks_of(model, runs, _excess(result, errors, stroke))
-        for errors in (result.held_out, result.after)
+        blocks_of(model, runs, excess(result, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))
+        for e in (result.held_out.by_segment if result.held_out else {}, result.after.by_segment)
     )
     if same is None or other is None:
         return result
@@ -102,14 +102,14 @@ def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
     return [replace(run, predicted=run.predicted + moved[run.record]) for run in runs]
 
 
-def _excess(result: Diagnosis, errors: Errors | None, stroke: float) -> dict[str, float]:
-    """Compute by how much held-out errors exceed errors of the fit, by segment, squares [m^2]."""
-    held, fitted = {} if errors is None else errors.by_segment, dict[str, list[Array]]()
+def excess(result: Diagnosis, held_out: Mapping[str, float]) -> dict[str, float]:
+    """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
+    fitted = dict[str, list[Array]]()
     for r in result.residuals:
         for label, start, stop in stretches(r.record, r.piece):
-            if label in held:
+            if label in held_out:
                 fitted.setdefault(label, []).append(r.after[start:stop][r.sound[start:stop]])
     return {
-        label: max((0.01 * held[label] * stroke) ** 2 - float(np.concatenate(e).var()), 0.0)
+        label: max(held_out[label] - float(np.concatenate(e).var()), 0.0)
         for label, e in fitted.items()
     }

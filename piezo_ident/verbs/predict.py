@@ -19,8 +19,8 @@ from piezo_ident.model.multi_axis import EachAxis, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
-from piezo_ident.uncertainty.prediction import half_widths, with_interval
-from piezo_ident.verbs.shared_modes import modes_half_widths, with_half_widths
+from piezo_ident.uncertainty.prediction import half_widths, with_half_widths
+from piezo_ident.verbs.shared_modes import modes_half_widths
 
 
 @overload
@@ -85,7 +85,10 @@ def free_run(
     """
     if not isinstance(model, MultiAxisModel):
         run = run_axis(model, record)
-        return run if interval is None else with_interval(model, run, interval)
+        if interval is None:
+            return run
+        own = half_widths(model, run.record, run.pieces, interval, run.estimated)
+        return with_half_widths(run, interval, own)
     expect(record, Record, 'free_run, second argument', 'read a file with read')
     seen = model.seen(record)
     unknown = [a for a in axes or model.axes if a not in seen or not is_measured(record, a)]
@@ -96,25 +99,18 @@ def free_run(
         )
     kept = {axis: seen[axis] for axis in axes or model.axes}
     if model.modes is not None:
-        runs = _of_modes(model, model.modes.settling, record, kept)
+        predicted = model.predicted(record)
+        # no prediction knows the motion before a record
+        late = [min(model.modes.settling, piece.n) for piece in record]
+        runs = {
+            axis: compared(model.axes[axis], without_faults(one), predicted[axis], late)
+            for axis, one in kept.items()
+        }
         if interval is not None:
-            half = modes_half_widths(model, model.modes, record, interval)
+            half = modes_half_widths(model, model.modes, seen, predicted, interval)
             runs = {a: with_half_widths(x, interval, half[a]) for a, x in runs.items()}
         return EachAxis(runs)
     return EachAxis({axis: free_run(model.axes[axis], x, interval) for axis, x in kept.items()})
-
-
-def _of_modes(
-    model: MultiAxisModel, settling: int, record: Record, seen: Mapping[str, Record]
-) -> dict[str, FreeRun]:
-    """Compare the prediction of shared modes with the record of each axis."""
-    predicted = model.predicted(record)
-    # no prediction knows the motion before a record
-    late = [min(settling, piece.n) for piece in record]
-    return {
-        axis: compared(model.axes[axis], without_faults(one), predicted[axis], late)
-        for axis, one in seen.items()
-    }
 
 
 def predict(
@@ -132,12 +128,15 @@ def bands(
     predicted: Mapping[str, Sequence[Array]],
     interval: float,
 ) -> dict[str, tuple[Array, ...]]:
-    """Compute the half widths [m] of predictions from voltages alone, by axis."""
-    if isinstance(model, MultiAxisModel) and model.modes is not None:
-        half = modes_half_widths(model, model.modes, record, interval)
-        return {axis: half[axis] for axis in predicted}
-    models = models_of(model)
+    """
+    Compute the half widths [m] of predictions from voltages alone, by axis.
+
+    Shared modes need the predictions of all axes.
+    """
     seen = model.seen(record) if isinstance(model, MultiAxisModel) else {'y': record}
+    if isinstance(model, MultiAxisModel) and model.modes is not None:
+        return modes_half_widths(model, model.modes, seen, predicted, interval)
+    models = models_of(model)
     return {k: half_widths(models[k], seen[k], x, interval) for k, x in predicted.items()}
 
 

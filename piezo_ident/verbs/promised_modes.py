@@ -10,14 +10,12 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from piezo_ident.common.arrays import Array
-from piezo_ident.diagnosis.held_out import stretches
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.multi_axis import SHARED_MODES
 from piezo_ident.selection.judged import JudgedRun
 from piezo_ident.uncertainty.calibration import blocks_of, calibrated
-from piezo_ident.uncertainty.promises import promise_of, with_band
+from piezo_ident.uncertainty.promises import excess, promise_of, with_band
 
 
 def promised_modes(result: Diagnosis, held_out: Mapping[str, float]) -> Diagnosis:
@@ -27,27 +25,16 @@ def promised_modes(result: Diagnosis, held_out: Mapping[str, float]) -> Diagnosi
     `held_out` has the mean squared error on multisines held out [m^2], by the label of segments.
     The model keeps errors and band of the modes apart from those of its chain.
     """
-    zeros = [np.zeros(r.piece.n, dtype=bool) for r in result.residuals]
     runs = [
-        JudgedRun(r.record, r.piece, r.piece.y - r.after, r.sound, none)
-        for r, none in zip(result.residuals, zeros, strict=True)
+        JudgedRun(r.record, r.piece, r.piece.y - r.after, r.sound, np.zeros_like(r.sound))
+        for r in result.residuals
     ]
-    fitted = dict[str, list[Array]]()
-    for run in runs:
-        for label, start, stop in stretches(run.record, run.piece):
-            fitted.setdefault(label, []).append(run.error[start:stop][run.use[start:stop]])
-    excess = {
-        label: max(held_out[label] - float(np.concatenate(e).var()), 0.0)
-        for label, e in fitted.items()
-        if label in held_out
-    }
     model = replace(result.model, effects=(), identification={})
-    blocks = blocks_of(model, runs, excess)
+    blocks = blocks_of(model, runs, excess(result, held_out))
     if blocks is None:
         return result
     band, span = calibrated(blocks), abs(model.scaling.Y)
-    stroke = max(float(np.ptp(r.piece.y[r.sound])) for r in result.residuals if r.sound.any())
-    promise = promise_of(blocks, blocks, band, span, stroke)
+    promise = promise_of(blocks, blocks, band, span, result.stroke)
     mean, worst = (
         percent(span * math.sqrt(square), span)
         for square in (

@@ -5,33 +5,34 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.model.free_run import FreeRun
 from piezo_ident.model.initial_memory import is_at_rest
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.modes.stream import MemorySpread
 from piezo_ident.model.multi_axis import judged_models, MultiAxisModel
 from piezo_ident.record.record import Record
 from piezo_ident.uncertainty.band import BandStream
-from piezo_ident.uncertainty.prediction import unknown_parts
 
 
 def modes_half_widths(
-    model: MultiAxisModel, modes: SharedModes, record: Record, level: float
+    model: MultiAxisModel,
+    modes: SharedModes,
+    seen: Mapping[str, Record],
+    predicted: Mapping[str, Sequence[Array]],
+    level: float,
 ) -> dict[str, tuple[Array, ...]]:
     """
     Compute the half width of the band of each piece of a record with shared modes, by axis [m].
 
-    The voltage alone is known.  Where a piece does not start at rest, the band contains all
-    possible plays until the motion has swept them.
+    `seen` has the record of every axis.  The voltage alone is known.  Where a piece does not start
+    at rest, the band contains all possible plays until the motion has swept them.
     """
     each, order = judged_models(model), sorted(model.axes)
-    seen, predicted = model.seen(record), model.predicted(record)
     found: dict[str, list[Array]] = {axis: [] for axis in order}
-    for i in range(len(record.pieces)):
+    for i in range(len(seen[order[0]].pieces)):
         pieces = [seen[axis].pieces[i] for axis in order]
         v = np.column_stack([piece.v for piece in pieces])
         y = np.column_stack([predicted[axis][i] for axis in order])
@@ -42,9 +43,3 @@ def modes_half_widths(
             band = BandStream(each[axis], level)
             found[axis].append(band.follow(v[:, j], y[:, j]) + level * spread[:, j])
     return {axis: tuple(half) for axis, half in found.items()}
-
-
-def with_half_widths(run: FreeRun, level: float, half: tuple[Array, ...]) -> FreeRun:
-    """Add half widths [m] to a free run, and a warning where nothing is known."""
-    warnings = [f'{run.record.name}: {text}' for text in unknown_parts(half)]
-    return replace(run, interval=level, half_widths=half, warnings=(*run.warnings, *warnings))
