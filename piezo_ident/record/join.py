@@ -172,7 +172,7 @@ def join(
     t = times[first]
     in_step = _in_step(every, times)
     matches = in_step or {
-        name: _matches(t, lead.arrivals, times[name], s.arrivals) for name, s in every.items()
+        name: _matches(t, lead.arrivals, times[name], s.arrivals) for name, s in streams.items()
     }
     keep = np.ones(lead.n, dtype=np.bool_)
     for name in streams:
@@ -180,6 +180,11 @@ def join(
         for i, _, n in (*matches[name], (lead.n, 0, 0)):
             keep[end:i] = False
             end = i + n
+    if beside and not in_step:
+        # a row that came again and is left out has no partner
+        kept = np.where(keep, t, np.nan)
+        for name, s in beside.items():
+            matches[name] = _matches(kept, lead.arrivals, times[name], s.arrivals)
     shared = int(np.count_nonzero(keep))
     low = max(np.nanmin(times[name], initial=np.inf) for name in streams)
     high = min(np.nanmax(times[name], initial=-np.inf) for name in streams)

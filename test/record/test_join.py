@@ -119,3 +119,21 @@ def test_a_short_time_together_is_told_from_another_clock(clock):
     else:
         with pytest.raises(DataError, match=r'share only \d+ of \d+ time stamps'):
             join(streams)
+
+
+def test_a_channel_belongs_to_the_row_that_stays_of_a_block_that_came_twice():
+    rows = np.arange(SIZE)
+
+    def of(arrivals, values):
+        made = BlockStream()
+        for k, arrived in arrivals:
+            made.append(Samples((k * SIZE + rows) / RATE, values + k), arrived)
+        return made
+
+    voltage = of([(0, 0), (1, 100), (1, 200), (2, 300)], rows)
+    # the displacement came soon, the applied voltage after the block that came again
+    displacement = of([(0, 10), (1, 110), (2, 310)], -rows)
+    applied = of([(0, 20), (1, 190), (2, 320)], rows)
+    joined = join({'voltage': voltage, 'displacement': displacement}, {'applied_voltage': applied})
+    np.testing.assert_array_equal(joined.columns['applied_voltage'], joined.columns['voltage'])
+    assert [fault.name for fault in joined.faults] == ['repeated_rows']
