@@ -160,6 +160,9 @@ def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
     # a few relaxations are no exact logarithm; the squares bend towards them
     basis = np.column_stack([np.ones(n), t, t * t, lg, lg * lg])
     series = _detrended(part.e[s.start + skip : s.stop], n, basis)
+    # a mode that rings starts at once, and would be in every bin of the spectrum
+    window = np.hanning(n + 2)[1:-1]
+    series *= window / np.sqrt(np.mean(window**2))
     return _reading(part, series, n, n // 16, basis.shape[1])
 
 
