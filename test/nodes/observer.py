@@ -72,10 +72,10 @@ class Observer:
 
     def _known_to(self, name: str, meanwhile: Callable[[], None] = lambda: None) -> None:
         """
-        Wait until a node knows of all readers of the observer.
+        Wait until a node knows of all readers and writers of the observer.
 
         It hears of them in the order in which they were made: once its status comes to a new
-        one, it knows of those before.
+        reader, it knows of those before.
         """
         came = threading.Event()
         last = self.node.create_subscription(
@@ -198,15 +198,19 @@ class Observer:
     def matched(self, topic: str, publishers: int = 1) -> None:
         """Wait until this many publish a collected topic, and know who listens to it."""
         self.collect(topic)
+        self._meet(self.node.get_publishers_info_by_topic, topic, publishers)
+
+    def _meet(self, ask: Callable[[str], list[Any]], topic: str, count: int) -> None:
+        """Wait until this many have an end of a topic, and know of the observer's."""
 
         def found() -> list[str]:
-            infos = self.node.get_publishers_info_by_topic(self.node.resolve_topic_name(topic))
+            infos = ask(self.node.resolve_topic_name(topic))
             return [f'{i.node_namespace}/{i.node_name}'.strip('/') for i in infos]
 
         # of an endpoint that was met before its node the name is not known
         self.wait(
-            lambda: len(n := found()) >= publishers and not any('UNKNOWN' in x for x in n),
-            f'publishers of {topic}',
+            lambda: len(n := found()) >= count and not any('UNKNOWN' in x for x in n),
+            f'those at {topic}',
         )
         for name in found():
             if name in self._statuses:
@@ -327,6 +331,8 @@ class Observer:
             self.wait(
                 lambda: publisher.get_subscription_count() >= wanted, f'listeners to {topic}'
             )
+            # who does not know the publisher yet hears nothing of it
+            self._meet(self.node.get_subscriptions_info_by_topic, topic, wanted)
         message = to_message(block) if isinstance(block, Samples) else block
         self._publishers[topic].publish(message)
 
