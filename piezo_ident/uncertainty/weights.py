@@ -7,15 +7,16 @@ Weigh the candidates of a diagnosis by their errors on kinds of motion that were
 A set s of effects leaves the mean square E_s on N kinds of motion that were held out.  A kind
 counts as one observation of unknown size.  The weight of the set is
 
-    w_s = p_s E_s^(-N/2) / sum of all,
+    w_s = p_s (E_s / T^n)^(-N/2) / sum of all,
 
 pseudo Bayesian model averaging: Y. Yao, A. Vehtari, D. Simpson and A. Gelman, "Using stacking to
 average Bayesian predictive distributions", Bayesian Analysis 13(3), 2018, doi:10.1214/17-BA1091.
 
-``none of these`` stands for a stage that lacks nothing, and for a cause outside of the catalogue.
-Its E is the mean square without an effect times `TAKES`, the least share that a cause takes.  The
-prior of none is `NONE`.  A further effect is `FURTHER` times as likely as the first one, and sets
-of one size are equally likely.
+T is `TAKES`: an effect that leaves more than this share has taken the error of another law.  n is
+the number of effects; one that contains narrower effects counts twice.  ``none of these``, n = 0,
+stands for a stage that lacks nothing, and for a cause outside of the catalogue.  Its prior is
+`NONE`.  A further effect is `FURTHER` times as likely as the first one, and sets of one size are
+equally likely.
 
 Limits: the number of kinds bounds how well E_s is known, and only sets that the search fitted are
 compared.  Effects with tests of their own, such as hum, have no weight.
@@ -27,6 +28,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import TAKES
+from piezo_ident.effects import find_effect
 
 #: name of the last weight
 NOTHING = 'none of these'
@@ -60,9 +62,8 @@ def weights_of(errors: Mapping[tuple[str, ...], float], kinds: int) -> dict[str,
         n, square = len(effects), max(error**2, np.finfo(float).tiny)
         prior = (1.0 - NONE) * FURTHER**n / whole / sizes.count(n) if n else NONE
         power = -0.5 * (kinds or PARTS)
-        logs['+'.join(effects) or NOTHING] = np.log(prior) + power * np.log(
-            square if n else TAKES * square
-        )
+        steps = n + sum(bool(find_effect(name).contains) for name in effects)
+        logs['+'.join(effects) or NOTHING] = np.log(prior) + power * np.log(square / TAKES**steps)
     most = max(logs.values(), default=0.0)
     found = {name: float(np.exp(x - most)) for name, x in logs.items()}
     total = sum(found.values())
