@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.export.header import c_number, plain_text
 from piezo_ident.export.header import export_c as export_axis
-from piezo_ident.export.header import plain_text
 from piezo_ident.export.links import LinkGroup, links_of
 from piezo_ident.export.modes_header import export_modes
 from piezo_ident.model.axis_records import MOTION, motion_of, voltage_of
@@ -58,21 +59,37 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
         return export_axis(model, name, **options)
     if model.modes is not None:
         return export_modes(model, model.modes, name, **options)
-    tags = {axis: f'{name}_{axis.lower()}' for axis in model.axes}
-    alike = [axis for axis in tags if [*tags.values()].count(tags[axis]) > 1]
+    states = _states(model)
+    tags = {member: f'{name}_{member.lower()}' for member in states}
+    alike = [axis for axis in model.axes if [*tags.values()].count(tags[axis]) > 1]
     if alike:
         raise ConfigError(
             f'axes {" and ".join(alike)}: differ by case alone, so their C code has the same '
             'names; rename one of them in the model file'
         )
-    sources = [
-        a for a in model.axes if any(motion_of(a) in channels_of(x) for x in model.axes.values())
-    ]
+    own = {'feedforward': False}
     texts = [
-        export_axis(model.own(axis), f'{tags[axis]}_own', feedforward=False) for axis in sources
+        export_axis(x, tags[member], **(options if member in model.axes else own))
+        for member, x in states.items()
     ]
-    texts += [export_axis(x, tags[axis], **options) for axis, x in model.axes.items()]
-    return '\n'.join([*texts, _stage(model, name, tags, sources)])
+    return '\n'.join([*texts, _stage(model, name, states, tags)])
+
+
+def _states(model: MultiAxisModel) -> dict[str, StageModel]:
+    """List the chains that the state of a header runs by its members."""
+    felt = {channel for x in model.axes.values() for channel in channels_of(x)}
+    own = {f'own_{a}': model.own(a) for a in model.axes if motion_of(a) in felt}
+    return {**own, **model.axes}
+
+
+def _further(states: Mapping[str, StageModel]) -> dict[str, str]:
+    """List the channels that a caller sets by their place in the state."""
+    return {
+        f'{member}.channel[{k}]': channel
+        for member, x in states.items()
+        for k, channel in enumerate(channels_of(x))
+        if not channel.startswith(MOTION)
+    }
 
 
 def channels_of(model: StageModel) -> list[str]:
@@ -81,32 +98,36 @@ def channels_of(model: StageModel) -> list[str]:
     return LinkGroup(links).channels
 
 
-def _stage(model: MultiAxisModel, name: str, tags: dict[str, str], sources: list[str]) -> str:
+def _stage(
+    model: MultiAxisModel, name: str, states: Mapping[str, StageModel], tags: Mapping[str, str]
+) -> str:
     """Write the C code of the whole stage, which follows the headers of its axes."""
-    order, n = list(model.axes), len(model.axes)
-    members = [f'    {tags[a]}_own_state own_{a};' for a in sources]
-    members += [f'    {tags[a]}_state {a};' for a in order]
-    rest = [f'    {tags[a]}_own_reset(&s->own_{a}, v[{order.index(a)}]);' for a in sources]
-    rest += [f'    y[{i}] = {tags[a]}_reset(&s->{a}, v[{i}]);' for i, a in enumerate(order)]
-    step, further = [], []
-    for a in sources:
-        i = order.index(a)
-        step.append(f'    const double own_{a} = {tags[a]}_own_step(&s->own_{a}, v[{i}]);')
-    for i, (axis, x) in enumerate(model.axes.items()):
-        for k, channel in enumerate(channels_of(x)):
-            if channel.startswith(MOTION):
-                step.append(f'    s->{axis}.channel[{k}] = own_y{channel[len(MOTION) :]};')
-            else:
-                further.append(f' *     s.{axis}.channel[{k}]  {plain_text(channel)}')
-        step.append(f'    y[{i}] = {tags[axis]}_step(&s->{axis}, v[{i}]);')
+    order, n, P = list(model.axes), len(model.axes), name.upper()
+    rest, step = [], []
+    for member, x in states.items():
+        is_own = member not in order
+        i = order.index(member.removeprefix('own_'))
+        given = f'(&s->{member}, v[{i}]);'
+        step += [
+            f'    s->{member}.channel[{k}] = own_y{channel[len(MOTION) :]};'
+            for k, channel in enumerate(channels_of(x))
+            if channel.startswith(MOTION)
+        ]
+        moved = f'const double {member}' if is_own else f'y[{i}]'
+        step.append(f'    {moved} = {tags[member]}_step{given}')
+        rest.append(f'    {"" if is_own else f"y[{i}] = "}{tags[member]}_reset{given}')
+    further = [f' *     s.{x}  {plain_text(channel)}' for x, channel in _further(states).items()]
     call = f'{name}_state *s, const double v[{n}], double y[{n}]'
     return '\n'.join(
         [
             f'/* The stage of {n} axes: v is {", ".join(map(voltage_of, order))}, '
             f'y is {", ".join(order)}. */',
             *(['/* Before each step the caller sets', *further, ' */'] if further else []),
-            f'#ifndef {name.upper()}_OF_AXES\n#define {name.upper()}_OF_AXES\n',
-            f'typedef struct {{\n{chr(10).join(members)}\n}} {name}_state;\n',
+            f'#ifndef {P}_OF_AXES\n#define {P}_OF_AXES\n',
+            f'#define {P}_RATE {c_number(model.sample_rate)} /* samples a second */\n',
+            'typedef struct {',
+            *(f'    {tags[member]}_state {member};' for member in states),
+            f'}} {name}_state;\n',
             f'static inline void {name}_reset({call})\n{{',
             *rest,
             f'}}\n\nstatic inline void {name}_step({call})\n{{',

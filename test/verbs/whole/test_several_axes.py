@@ -227,8 +227,11 @@ def test_an_axis_sees_no_label_under_which_it_rests():
 
 
 @needs_compiler
-def test_the_header_in_c_does_what_the_model_does(tmp_path):
-    stage, v = scanner(), [x - x[0] for x in raster(400)]
+@pytest.mark.parametrize('name', ['b', 'own'])
+def test_the_header_in_c_does_what_the_model_does(name, tmp_path):
+    first, second = scanner().axes.values()
+    first, axis = path(first, f'motion_{name}', CROSS[1]), f'y_{name}'
+    stage, v = MultiAxisModel({'y': first, axis: second}), [x - x[0] for x in raster(400)]
     (tmp_path / 'stage.h').write_text(pi.export_c(stage))
     (tmp_path / 'main.c').write_text(MAIN)
     command = [COMPILER, *STRICT, 'main.c', '-o', 'main', '-lm']
@@ -236,5 +239,11 @@ def test_the_header_in_c_does_what_the_model_does(tmp_path):
     given = '\n'.join(f'{a!r} {b!r}' for a, b in np.transpose(v).tolist())
     done = subprocess.run([tmp_path / 'main'], input=given, capture_output=True, text=True)
     made = np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
-    y = stage.simulate({'v': v[0], 'v_b': v[1]})
-    np.testing.assert_allclose(made, np.column_stack([y['y'], y['y_b']]), atol=1e-15)
+    y = stage.simulate({'v': v[0], f'v_{name}': v[1]})
+    np.testing.assert_allclose(made, np.column_stack([y['y'], y[axis]]), atol=1e-15)
+
+
+def test_the_header_names_all_channels_that_the_caller_sets():
+    first, second = scanner().axes.values()
+    header = pi.export_c(MultiAxisModel({'y': path(first, 'heat', 0.01), 'y_b': second}))
+    assert 's.own_y.channel[0]  heat' in header and 's.y.channel[0]  heat' in header
