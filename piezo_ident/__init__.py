@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from piezo_ident.control.live_inverse import LiveInverse
     from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings
     from piezo_ident.excitation.program import Program
-    from piezo_ident.export.fmu import export_fmu
     from piezo_ident.identification.results import Identification
     from piezo_ident.identification.settings import Settings
     from piezo_ident.live.guard import Guard, GuardSettings
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
     from piezo_ident.record.io import read, write
     from piezo_ident.record.record import Record
     from piezo_ident.report.folder import write_report
-    from piezo_ident.verbs.export import export_c
+    from piezo_ident.verbs.export import export_c, export_fmu
     from piezo_ident.verbs.invert import invert, MultiAxisInverse
     from piezo_ident.verbs.learn import diagnose, identify
     from piezo_ident.verbs.predict import free_run
@@ -85,7 +84,7 @@ _HOMES = {
     'diagnose': 'verbs.learn',
     'effects': 'effects',
     'export_c': 'verbs.export',
-    'export_fmu': 'export.fmu',
+    'export_fmu': 'verbs.export',
     'free_run': 'verbs.predict',
     'identify': 'verbs.learn',
     'invert': 'verbs.invert',

@@ -242,8 +242,7 @@ def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:
 
 def export_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident export``."""
-    from piezo_ident.export.fmu import export_fmu
-    from piezo_ident.verbs.export import export_c
+    from piezo_ident.verbs.export import export_c, export_fmu
 
     if args.out is None:
         raise ConfigError('export: no file is named', options='--out stage.h')
@@ -273,10 +272,6 @@ def export_command(args: SimpleNamespace, console: Console) -> None:
             axes = [f'_{axis.lower()}' for axis in getattr(model, 'axes', ())]
             known = [f'{name}_step', *(f'{name}{x}_feedforward_step' for x in ('', *axes))]
             functions = [function for function in known if f'{function}(' in header]
-        elif isinstance(model, MultiAxisModel):
-            raise ConfigError(
-                f'{args.model}: has several axes; an FMU holds one, write a header .h'
-            )
         else:
             export_fmu(model, args.out, name)
     console.say(' '.join([f'wrote {args.out}', *([f'with {", ".join(functions)}'] * is_header)]))

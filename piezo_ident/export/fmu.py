@@ -10,53 +10,44 @@ compiles the FMU, for example FMPy, supplies the headers of FMI.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 import os
 import uuid
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from piezo_ident import __version__
-from piezo_ident.common.errors import ModelError
 from piezo_ident.common.files import temporary_output
-from piezo_ident.export.header import c_number, export_c, plain_text, render
-from piezo_ident.export.links import LinkGroup, links_of
-from piezo_ident.model.multi_axis import MultiAxisModel
-from piezo_ident.model.stage_model import StageModel
+from piezo_ident.export.header import c_number, plain_text, render
 
 
-def export_fmu(
-    model: StageModel | MultiAxisModel, path: str | os.PathLike[str], name: str = 'stage'
+def write_fmu(
+    path: str | os.PathLike[str],
+    name: str,
+    header: str,
+    sample_rate: float,
+    rests: Mapping[str, float],
+    clocks: Sequence[str],
+    channels: Mapping[str, str],
 ) -> None:
     """
-    Write a model as an FMU in source: FMI 3.0, co-simulation.
-
-    The inputs are ``voltage`` [V], and ``x_<name>`` for each further channel.  The output is
-    ``displacement`` [m].  An existing file is replaced.
+    Write a C header as an FMU; see `piezo_ident.export_fmu`.
 
     Parameters
     ----------
-    model : StageModel
     path : str or path-like
-    name : str, optional
-        Identifier of the model in C.
-
-    Raises
-    ------
-    ConfigError
-        If the name is not an identifier in C.
-    ModelError
-        If an effect of the model has no C code, or the model has several axes.
-    DataError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> pi.export_fmu(pi.SimulatedStage.load('paper').model, 'stage.fmu')
+    name : str
+        Beginning of all names in the header.
+    header : str
+    sample_rate : float
+        [Hz]
+    rests : mapping of str to float
+        Voltage of each axis before it is set [V], by what follows ``voltage`` in its name.
+    clocks : sequence of str
+        Members of the state that count samples; ``k`` alone in the state of one axis.
+    channels : mapping of str to str
+        Names of the further channels by the members of the state that hold them.
     """
-    if isinstance(model, MultiAxisModel):
-        raise ModelError('export: the model has several axes, and an FMU holds one; use export_c')
-    header = export_c(model, name, feedforward=False)
-    links = [link for part in links_of(model) for link in part.links]
+    inputs = [*dict.fromkeys(channels.values())]
     values = {
         'p': name,
         'P': name.upper(),
@@ -64,9 +55,12 @@ def export_fmu(
         'version': __version__,
         # the token identifies the model, so another model is another FMU
         'token': f'{{{uuid.uuid5(uuid.NAMESPACE_OID, header)}}}',
-        'period': repr(1.0 / model.sample_rate),
-        'rest': c_number(model.scaling.range[0]).strip('()'),
-        'channels': [plain_text(name) for name in LinkGroup(links).channels],
+        'period': repr(1.0 / sample_rate),
+        'axes': {axis: c_number(v).strip('()') for axis, v in rests.items()},
+        'several': [*clocks] != ['k'],
+        'clocks': clocks,
+        'channels': [plain_text(channel) for channel in inputs],
+        'members': {x: len(rests) + inputs.index(c) for x, c in channels.items()},
     }
     files = {
         'modelDescription.xml': render('modelDescription.xml', **values),

@@ -1,20 +1,22 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Export a model of one axis or of several as a C header."""
+"""Export a model of one axis or of several as a C header or an FMU."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+import os
 from typing import Any
 
 from piezo_ident.common.errors import ConfigError
+from piezo_ident.export.fmu import write_fmu
 from piezo_ident.export.header import c_number, plain_text
 from piezo_ident.export.header import export_c as export_axis
 from piezo_ident.export.links import LinkGroup, links_of
 from piezo_ident.export.modes_header import export_modes
 from piezo_ident.model.axis_records import MOTION, motion_of, voltage_of
-from piezo_ident.model.multi_axis import MultiAxisModel
+from piezo_ident.model.multi_axis import models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
 
@@ -75,8 +77,56 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     return '\n'.join([*texts, _stage(model, name, states, tags)])
 
 
-def _states(model: MultiAxisModel) -> dict[str, StageModel]:
-    """List the chains that the state of a header runs by its members."""
+def export_fmu(
+    model: StageModel | MultiAxisModel, path: str | os.PathLike[str], name: str = 'stage'
+) -> None:
+    """
+    Write a model as an FMU in source: FMI 3.0, co-simulation.
+
+    The inputs are ``voltage`` [V], and ``x_<name>`` for each further channel.  The output is
+    ``displacement`` [m].  Axis ``y_b`` has ``voltage_b`` and ``displacement_b``.  An existing file
+    is replaced.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    path : str or path-like
+    name : str, optional
+        Identifier of the model in C.
+
+    Raises
+    ------
+    ConfigError
+        If the name is not an identifier in C, or two axes have the same names there.
+    ModelError
+        If an effect of the model has no C code.
+    DataError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import piezo_ident as pi
+    >>> pi.export_fmu(pi.SimulatedStage.load('paper').model, 'stage.fmu')
+    """
+    header = export_c(model, name, feedforward=False)
+    states = _states(model)
+    write_fmu(
+        path,
+        name,
+        header,
+        model.sample_rate,
+        rests={axis[1:]: x.scaling.range[0] for axis, x in models_of(model).items()},
+        clocks=[f'{member}.k'.removeprefix('.') for member in states],
+        channels=_further(states),
+    )
+
+
+def _states(model: StageModel | MultiAxisModel) -> dict[str, StageModel]:
+    """List the chains that the state of a header runs by its members; one chain has no member."""
+    if isinstance(model, StageModel):
+        return {'': model}
+    if model.modes is not None:
+        return {}
     felt = {channel for x in model.axes.values() for channel in channels_of(x)}
     own = {f'own_{a}': model.own(a) for a in model.axes if motion_of(a) in felt}
     return {**own, **model.axes}
@@ -85,10 +135,10 @@ def _states(model: MultiAxisModel) -> dict[str, StageModel]:
 def _further(states: Mapping[str, StageModel]) -> dict[str, str]:
     """List the channels that a caller sets by their place in the state."""
     return {
-        f'{member}.channel[{k}]': channel
+        f'{member}.channel[{k}]'.removeprefix('.'): channel
         for member, x in states.items()
         for k, channel in enumerate(channels_of(x))
-        if not channel.startswith(MOTION)
+        if not (member and channel.startswith(MOTION))
     }
 
 

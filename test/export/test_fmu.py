@@ -12,17 +12,26 @@ import sys
 from c_compiler import needs_compiler
 from effect_table import VISIBLE
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
 import piezo_ident as pi
 from piezo_ident.model.stage_model import EffectSetting
 import pytest
+from random_models import random_modes_model, random_voltages
 
 fmpy = pytest.importorskip('fmpy', reason='FMPy is not installed (extra fmu)')
 
 NAMES = ('creep', 'rate_dependent_hysteresis', 'cross_coupling', 'thermal_drift')
 MODEL = replace(PAPER, effects=tuple(EffectSetting(name, VISIBLE[name]) for name in NAMES))
 TIME, DISPLACEMENT, VOLTAGE, OTHER = range(4)
+#: the second axis also moves by a share of the first, with all effects of the first
+PATH = {'channel': 'motion', 'gain': 0.02 / PAPER.scaling.Y, 'frequency': 1000.0}
+SECOND = replace(
+    PAPER,
+    effects=(EffectSetting('cross_coupling', PATH),),
+    scaling=replace(PAPER.scaling, range=(1.0, 10.0)),
+)
+CHAINS = pi.MultiAxisModel({'y': MODEL, 'y_b': SECOND})
 
 
 def test_it_is_valid_and_the_same_each_time(tmp_path):
@@ -46,37 +55,44 @@ def test_it_is_valid_and_the_same_each_time(tmp_path):
     assert other.instantiationToken != about.instantiationToken
 
 
-@pytest.fixture(scope='module')
-def path(tmp_path_factory):
-    path = tmp_path_factory.mktemp('fmu') / 'stage.fmu'
-    pi.export_fmu(MODEL, path)
+def compiled(model, folder):
+    """Export a model, let FMPy compile the FMU, and return the folder of its files."""
+    path = folder / 'stage.fmu'
+    pi.export_fmu(model, path)
     command = [sys.executable, '-m', 'fmpy', 'compile', '--all-warnings', '--warning-as-error']
     # cmake is installed beside this interpreter
     env = {**os.environ, 'PATH': f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}'}
     done = subprocess.run([*command, str(path)], capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
-    return path
+    return fmpy.extract(str(path), unzipdir=str(folder / 'unzipped'))
+
+
+def begun(folder, numbers, values, token='', time=0.0):
+    """Start an FMU under inputs, which have these numbers."""
+    from fmpy.fmi3 import FMU3Slave
+
+    fmu = FMU3Slave(
+        guid=token or fmpy.read_model_description(folder).instantiationToken,
+        unzipDirectory=folder,
+        modelIdentifier='stage',
+        instanceName='one',
+    )
+    fmu.instantiate()
+    fmu.enterInitializationMode(startTime=time)
+    fmu.setFloat64(numbers, values)
+    fmu.exitInitializationMode()
+    return fmu
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    return compiled(MODEL, tmp_path_factory.mktemp('fmu'))
 
 
 @pytest.fixture
-def start(path, tmp_path):
+def start(folder):
     """Return what starts the FMU under inputs."""
-    from fmpy.fmi3 import FMU3Slave
-
-    about = fmpy.read_model_description(str(path))
-    folder = fmpy.extract(str(path), unzipdir=str(tmp_path / 'unzipped'))
-
-    def started(voltage, other, token=about.instantiationToken):
-        fmu = FMU3Slave(
-            guid=token, unzipDirectory=folder, modelIdentifier='stage', instanceName='one'
-        )
-        fmu.instantiate()
-        fmu.enterInitializationMode(startTime=0.0)
-        fmu.setFloat64([VOLTAGE, OTHER], [voltage, other])
-        fmu.exitInitializationMode()
-        return fmu
-
-    return started
+    return lambda *values, **options: begun(folder, [VOLTAGE, OTHER], values, **options)
 
 
 def displacement(fmu):
@@ -132,9 +148,80 @@ def test_what_is_no_number_or_another_model_is_refused(start):
 
 
 @needs_compiler
-def test_fmpy_simulates_it(path):
-    result = fmpy.simulate_fmu(str(path), stop_time=0.01, start_values={'voltage': 4.0})
+def test_fmpy_simulates_it(folder):
+    result = fmpy.simulate_fmu(folder, stop_time=0.01, start_values={'voltage': 4.0})
     still, none = np.full(len(result), 4.0), np.zeros(len(result))
     expected = MODEL.simulate(still, channels={'other_axis': none})
     assert len(result) > 100
     assert_allclose(result['displacement'], expected, rtol=1e-9)
+
+
+def played(fmu, numbers, inputs, outputs, time=0.0):
+    """Return what an FMU answers to inputs, shape (samples, inputs)."""
+    answers = [fmu.getFloat64(outputs)]
+    for k, row in enumerate(inputs[1:]):
+        fmu.doStep(time + k / FS, 1.0 / FS)
+        fmu.setFloat64(numbers, row)
+        answers.append(fmu.getFloat64(outputs))
+    return np.array(answers)
+
+
+@pytest.fixture(scope='module')
+def chains(tmp_path_factory):
+    return compiled(CHAINS, tmp_path_factory.mktemp('chains'))
+
+
+@needs_compiler
+def test_variables_have_the_names_of_their_axes(chains):
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(chains) == []
+    about = fmpy.read_model_description(chains)
+    assert [x.name for x in about.modelVariables] == [
+        *('time', 'displacement', 'displacement_b', 'voltage', 'voltage_b', 'x_other_axis')
+    ]
+    assert [x.variable.name for x in about.outputs] == ['displacement', 'displacement_b']
+    still = fmpy.simulate_fmu(chains, stop_time=0.01, start_values={'voltage': 4.0})
+    # a voltage that nobody sets is the lowest of the axis
+    one = np.ones(len(still))
+    y = CHAINS.simulate({'v': 4.0 * one, 'v_b': one}, channels={'other_axis': 0.0 * one})
+    for axis, name in (('y', 'displacement'), ('y_b', 'displacement_b')):
+        assert_allclose(still[name], y[axis], rtol=1e-9)
+
+
+@needs_compiler
+def test_chains_of_several_axes_feel_one_another_from_any_time_on(chains):
+    rng, time = np.random.default_rng(5), 3.0
+    v = np.clip(5.0 + np.cumsum(rng.standard_normal((2000, 2)), axis=0), 0.0, 10.0)
+    other = np.cumsum(rng.standard_normal(len(v))) / 20.0
+    t = time + np.arange(len(v)) / FS
+    # drift follows the time of the simulation
+    first = MODEL.stream().process(v[:, 0], t, {'other_axis': other})
+    second = SECOND.stream().process(v[:, 1], t, {'motion': first})
+    inputs = np.column_stack([v, other])
+    fmu = begun(chains, [3, 4, 5], inputs[0], time=time)
+    y = played(fmu, [3, 4, 5], inputs, [1, 2], time)
+    assert_allclose(y, np.column_stack([first, second]), rtol=0, atol=1e-12 * np.ptp(first))
+    first = MODEL.stream().process(v[:, 0], t - time, {'other_axis': other})
+    assert np.abs(first - y[:, 0]).max() > 1e-3 * np.ptp(first)
+
+
+@needs_compiler
+def test_shared_modes_are_those_of_python_to_the_last_bit(tmp_path):
+    rng = np.random.default_rng(6)
+    made = random_modes_model(rng)
+    # the order of the axes is not that of the alphabet
+    model = pi.MultiAxisModel(dict(zip(('y_b', 'y'), made.axes.values(), strict=True)), made.modes)
+    v = random_voltages(rng, model.modes, 2000)
+    y = model.simulate({'v_b': v[:, 0], 'v': v[:, 1]})
+    folder = compiled(model, tmp_path)
+    about = fmpy.read_model_description(folder)
+    assert [x.name for x in about.modelVariables][1:] == [
+        *('displacement_b', 'displacement', 'voltage_b', 'voltage')
+    ]
+    fmu = begun(folder, [3, 4], v[0])
+    assert_array_equal(played(fmu, [3, 4], v, [1, 2]), np.column_stack([y['y_b'], y['y']]))
+    saved, time = fmu.serializeFMUState(fmu.getFMUState()), (len(v) - 1) / FS
+    later = played(fmu, [3, 4], v[::-1], [2], time)
+    fmu.setFMUState(fmu.deserializeFMUState(saved))
+    assert_array_equal(played(fmu, [3, 4], v[::-1], [2], time), later)

@@ -1,3 +1,5 @@
+{% set n = axes | length %}
+{% set v = 'm->input, m->y' if several else 'm->input[0]' %}
 /*
  * {{ p }}.h as a co-simulation of FMI 3.0.
  *
@@ -9,10 +11,10 @@
 #include "fmi3Functions.h"
 #include "{{ p }}.h"
 
-enum { INPUTS = {{ 1 + channels | length }}, TIME = 0, DISPLACEMENT = 1, VOLTAGE = 2 };
+enum { INPUTS = {{ n + channels | length }}, TIME = 0, DISPLACEMENT = 1, VOLTAGE = {{ n + 1 }} };
 
 typedef struct {
-    double start, time, input[INPUTS];
+    double start, time, input[INPUTS]{{ ', y[' ~ n ~ ']' if several }};
     double taken; /* samples */
     int runs;
     {{ p }}_state state, trial;
@@ -20,31 +22,45 @@ typedef struct {
 
 static void set_inputs(const Instance *m, {{ p }}_state *s)
 {
+{% if several %}
+    (void)m; (void)s;
+{% for member, i in members.items() %}
+    s->{{ member }} = m->input[{{ i }}];
+{% endfor %}
+{% else %}
     int i;
     for (i = 1; i < INPUTS; i++)
         s->channel[i - 1] = m->input[i];
+{% endif %}
 }
 
-static void come_to_rest(const Instance *m, {{ p }}_state *s)
+static void come_to_rest({{ '' if several else 'const ' }}Instance *m, {{ p }}_state *s)
 {
-    {{ p }}_reset(s, m->input[0]);
-    s->k = m->start * {{ P }}_RATE;
+    {{ p }}_reset(s, {{ v }});
+{% for clock in clocks %}
+    s->{{ clock }} = m->start * {{ P }}_RATE;
+{% endfor %}
 }
 
-static double displacement(Instance *m)
+static double displacement(Instance *m{{ ', fmi3ValueReference axis' if several }})
 {
     if (m->runs)
         m->trial = m->state;
     else
         come_to_rest(m, &m->trial);
     set_inputs(m, &m->trial);
-    return {{ p }}_step(&m->trial, m->input[0]);
+    {{ '' if several else 'return ' }}{{ p }}_step(&m->trial, {{ v }});
+{% if several %}
+    return m->y[axis];
+{% endif %}
 }
 
 static void set_start(Instance *m)
 {
     memset(m, 0, sizeof *m);
-    m->input[0] = {{ rest }};
+{% for rest in axes.values() %}
+    m->input[{{ loop.index0 }}] = {{ rest }};
+{% endfor %}
 }
 
 const char *fmi3GetVersion(void)
@@ -124,7 +140,7 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 point, fmi3Float64 size
     (void)final;
     set_inputs(m, &m->state);
     for (; m->taken < due; m->taken += 1.0)
-        {{ p }}_step(&m->state, m->input[0]);
+        {{ p }}_step(&m->state, {{ v }});
     m->time = *last = point + size;
     *event = *end = *early = fmi3False;
     return fmi3OK;
@@ -150,8 +166,8 @@ fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference which[
     for (i = 0; i < n && i < n_values; i++) {
         if (which[i] == TIME)
             values[i] = m->time;
-        else if (which[i] == DISPLACEMENT)
-            values[i] = displacement(m);
+        else if (which[i] {{ '< VOLTAGE' if several else '== DISPLACEMENT' }})
+            values[i] = displacement(m{{ ', which[i] - DISPLACEMENT' if several }});
         else if (which[i] < VOLTAGE + INPUTS)
             values[i] = m->input[which[i] - VOLTAGE];
         else

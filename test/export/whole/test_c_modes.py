@@ -103,9 +103,3 @@ def test_settings_of_a_feed_forward_are_refused():
         pi.export_c(model, preview=20)
     with pytest.raises(pi.ConfigError, match='no name for C'):
         pi.export_c(model, 'Stage 1')
-
-
-def test_an_fmu_of_several_axes_is_refused(tmp_path):
-    with pytest.raises(pi.ModelError, match='an FMU holds one; use export_c'):
-        pi.export_fmu(CASES['2 axes'], tmp_path / 'stage.fmu')
-    assert not list(tmp_path.iterdir())
