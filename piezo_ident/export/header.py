@@ -40,6 +40,7 @@ from piezo_ident.control.linear_inverse import (
 )
 from piezo_ident.effects import find_effect
 from piezo_ident.export.links import Link, LinkGroup, links_of
+from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
 #: largest displacement that the inverse looks for [spans]
@@ -107,12 +108,7 @@ def export_c(
         links += ff.front.links
     scaling = model.scaling
     values: dict[str, Any] = {
-        'p': name,
-        'P': name.upper(),
-        'title': textwrap.wrap(plain_text(title) or repr(model), WIDTH),
-        'hertz': f'{model.sample_rate:g}',
-        'version': __version__,
-        'rate': c_number(model.sample_rate),
+        **common_values(model, name, title),
         **{k: c_number(getattr(scaling, k)) for k in ('v0', 'V', 'y0', 'Y')},
         'links': links,
         'parts': parts,
@@ -121,12 +117,24 @@ def export_c(
         'why': textwrap.wrap(why, WIDTH),
         'ff': ff,
     }
-    helpers = render(
-        'helpers.h', still=c_number(STILL), tolerance=c_number(TOLERANCE), trials=TRIALS
-    )
     if ff is not None:
         values['feedforward'] = _feedforward_text(ff, values)
-    return render('stage.h', **values, helpers=helpers)
+    return render('stage.h', **values)
+
+
+def common_values(model: StageModel | MultiAxisModel, name: str, title: str) -> dict[str, Any]:
+    """List what every header has: names, title, version, rate and helpers."""
+    return {
+        'p': name,
+        'P': name.upper(),
+        'title': textwrap.wrap(plain_text(title) or repr(model), WIDTH),
+        'version': __version__,
+        'hertz': f'{model.sample_rate:g}',
+        'rate': c_number(model.sample_rate),
+        'helpers': render(
+            'helpers.h', still=c_number(STILL), tolerance=c_number(TOLERANCE), trials=TRIALS
+        ),
+    }
 
 
 def _feedforward_or_reason(

@@ -15,12 +15,9 @@ import textwrap
 from typing import Any
 
 import numpy as np
-from piezo_ident import __version__
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ConfigError
-from piezo_ident.common.kernel import STILL
-from piezo_ident.control.hysteresis_inverse import TOLERANCE, TRIALS
-from piezo_ident.export.header import c_number, checked_name, plain_text, render, WIDTH
+from piezo_ident.export.header import c_number, checked_name, common_values, render, WIDTH
 from piezo_ident.model.axis_records import voltage_of
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.multi_axis import MultiAxisModel
@@ -71,12 +68,7 @@ def export_modes(
         tables |= {'mu': loop.mu, 'r': loop.r}
     return render(
         'modes.h',
-        p=name,
-        P=name.upper(),
-        title=textwrap.wrap(plain_text(title) or repr(model), WIDTH),
-        version=__version__,
-        hertz=f'{model.sample_rate:g}',
-        rate=c_number(model.sample_rate),
+        **common_values(model, name, title),
         axes=list(model.axes),
         voltages=', '.join(map(voltage_of, model.axes)),
         columns=[list(model.axes).index(axis) for axis in order],
@@ -91,9 +83,6 @@ def export_modes(
         kappa=c_number(loop.kappa),
         rest=c_number(1.0 - loop.kappa),
         constants=[line for k, x in tables.items() if x.size for line in _table(k, x)],
-        helpers=render(
-            'helpers.h', still=c_number(STILL), tolerance=c_number(TOLERANCE), trials=TRIALS
-        ),
     )
 
 
