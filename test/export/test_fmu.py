@@ -84,6 +84,14 @@ def begun(folder, numbers, values, token='', time=0.0):
     return fmu
 
 
+def test_a_channel_may_have_any_name(tmp_path):
+    values = {**VISIBLE['cross_coupling'], 'channel': 'heat <"a" & b>'}
+    model = replace(PAPER, effects=(EffectSetting('cross_coupling', values),))
+    pi.export_fmu(model, tmp_path / 'stage.fmu')
+    about = fmpy.read_model_description(str(tmp_path / 'stage.fmu'))
+    assert about.modelVariables[-1].name == 'x_heat <"a" & b>'
+
+
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     return compiled(MODEL, tmp_path_factory.mktemp('fmu'))
