@@ -213,7 +213,7 @@ def test_diagnostics(lab):
     lab.finish('excitation/start')
     for node, since in told.items():
         lab.wait(
-            lambda n=node, s=since: any(float(d['rate']) > 0 for d in lab.diagnoses(n)[s:]),
+            lambda n=node, s=since: any(float(d.get('rate', 0)) > 0 for d in lab.diagnoses(n)[s:]),
             f'the rate of the {node}',
         )
     seen = lab.diagnostics('excitation')
