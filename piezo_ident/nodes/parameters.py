@@ -68,48 +68,48 @@ def with_axes(topics: Sequence[str], axes: Sequence[str]) -> list[str]:
     return [*topics, *(f'{t}_{name}' for name in names for t in topics if t in kinds)]
 
 
-def _rate() -> Declaration:
-    return Declaration(
-        'sample_rate',
-        20000.0,
-        'rate of the sample clock that starts with the excitation',
-        'Hz',
-        1.0,
-        10e6,
-        read_only=True,
-    )
-
-
 def _volts(name: str, default: float, text: str) -> Declaration:
     return Declaration(name, default, text, 'V', -1000.0, 1000.0)
 
 
-def _limits(how: str) -> tuple[Declaration, Declaration]:
-    low, high = (f'{which} voltage that is ever {how}' for which in ('lowest', 'highest'))
-    return _volts('voltage_low', 0.0, low), _volts('voltage_high', 10.0, high)
-
-
-def _listeners(when: str) -> tuple[Declaration, Declaration]:
-    return (
-        Declaration('subscribers', 1, f'how many must {when}', '1', 0, 100),
-        Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
-    )
-
-
+_RATE = Declaration(
+    'sample_rate',
+    20000.0,
+    'rate of the sample clock that starts with the excitation',
+    'Hz',
+    1.0,
+    10e6,
+    read_only=True,
+)
+_LIMITS = (
+    _volts('voltage_low', 0.0, 'lowest voltage, whatever is asked for'),
+    _volts('voltage_high', 10.0, 'highest voltage, whatever is asked for'),
+)
+_SLEW = Declaration('slew', 40000.0, 'steepest voltage, whatever is asked for', 'V/s', 1.0, 1e9)
+_REST = (
+    _volts('rest', 0.0, 'rest voltage: before a stream, and after a stop or a silence'),
+    Declaration(
+        'ramp_slew', 20.0, 'top speed of ramps to rest and into a stream', 'V/s', 0.001, 1e6
+    ),
+)
+_LISTENERS = (
+    Declaration('subscribers', 1, 'how many must listen before the first block', '1', 0, 100),
+    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+)
 _MODEL = Declaration('model', '', 'model file to start with; empty: wait for the topic')
-
-
-def _axes(what: str) -> Declaration:
-    return Declaration(
-        'axes',
-        ('',),
-        f'names of further axes, {what}; empty names are left out',
-        read_only=True,
-    )
-
+_AXES = Declaration(
+    'axes',
+    ('',),
+    'names of further axes, each with topics voltage_<name> and so on; empty names are left out',
+    read_only=True,
+)
+_WINDOW = Declaration(
+    'window', 2.0, 'time over which the live or the tracking error is taken', 's', 0.1, 600.0
+)
+_AUTOSTART = Declaration('autostart', False, 'start at once', read_only=True)
 
 EXCITATION = (
-    _rate(),
+    _RATE,
     Declaration('program', 'identification', 'program to play: a name, a path, or YAML text'),
     Declaration(
         'quantity',
@@ -118,7 +118,7 @@ EXCITATION = (
         choices=('voltage', 'reference'),
         read_only=True,
     ),
-    _axes('each with signals of its own on voltage_<name>'),
+    _AXES,
     Declaration(
         'in_turn', False, 'whether the axes play the program one after the other, not at once'
     ),
@@ -126,10 +126,9 @@ EXCITATION = (
     Declaration(
         'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0
     ),
-    *_limits('sent'),
-    _volts('rest', 0.0, 'voltage to which a stop ramps'),
-    Declaration('ramp_slew', 20.0, 'top speed of the ramp of a stop', 'V/s', 0.001, 1e6),
-    *_listeners('listen to voltage before the first block'),
+    *_LIMITS,
+    *_REST,
+    *_LISTENERS,
 )
 
 STAGE = (
@@ -143,12 +142,9 @@ STAGE = (
         2**31 - 1,
         read_only=True,
     ),
-    *_limits('applied'),
-    Declaration('slew', 40000.0, 'steepest voltage that is ever applied', 'V/s', 1.0, 1e9),
-    _volts('rest', 0.0, 'voltage to which a silent drive is ramped'),
-    Declaration(
-        'ramp_slew', 20.0, 'speed of the ramps to rest and into a new stream', 'V/s', 0.001, 1e6
-    ),
+    *_LIMITS,
+    _SLEW,
+    *_REST,
     Declaration(
         'silence',
         0.5,
@@ -194,7 +190,7 @@ IDENTIFIER = (
     Declaration(
         'requests', 2, 'how often one ~/diagnose may ask the excitation for more', '1', 0, 10
     ),
-    _axes('which are identified too, from voltage_<name> and displacement_<name>'),
+    _AXES,
     Declaration(
         'channels',
         ('',),
@@ -209,7 +205,7 @@ IDENTIFIER = (
 
 MODEL = (
     _MODEL,
-    _axes('which are predicted too, from voltage_<name>'),
+    _AXES,
     Declaration(
         'warn_ratio',
         3.0,
@@ -218,7 +214,7 @@ MODEL = (
         1.0,
         1000.0,
     ),
-    Declaration('window', 2.0, 'time over which the live error is taken', 's', 0.1, 600.0),
+    _WINDOW,
     Declaration(
         'preview_rate',
         50.0,
@@ -278,7 +274,7 @@ RECORDER = (
         'topics to record',
         read_only=True,
     ),
-    _axes('whose topics are recorded too'),
+    _AXES,
     Declaration(
         'max_bag_size',
         0,
@@ -289,8 +285,8 @@ RECORDER = (
         10**15,
     ),
     Declaration('flush', 0.4, 'longest time that a message waits to be on disk', 's', 0.05, 0.5),
-    _rate(),
-    Declaration('autostart', False, 'start to record at once', read_only=True),
+    _RATE,
+    _AUTOSTART,
 )
 
 PLAYER = (
@@ -301,15 +297,15 @@ PLAYER = (
         ('voltage', 'displacement'),
         'topics to replay; a recorded model would overwrite the live one',
     ),
-    _axes('whose topics are replayed too'),
-    *_listeners('listen before the first message'),
-    Declaration('autostart', False, 'start to replay at once', read_only=True),
+    _AXES,
+    *_LISTENERS,
+    _AUTOSTART,
 )
 
 FEEDFORWARD = (
-    _rate(),
+    _RATE,
     _MODEL,
-    _axes('each with a reference_<name> that voltage_<name> follows'),
+    _AXES,
     Declaration(
         'preview',
         0.02,
@@ -319,12 +315,9 @@ FEEDFORWARD = (
         10.0,
         read_only=True,
     ),
-    *_limits('sent'),
-    Declaration('slew', 40000.0, 'steepest voltage that is ever sent', 'V/s', 1.0, 1e9),
-    _volts('rest', 0.0, 'voltage before a reference, and to which a stop ramps'),
-    Declaration(
-        'ramp_slew', 20.0, 'top speed of the ramps to rest and into a reference', 'V/s', 0.001, 1e6
-    ),
+    *_LIMITS,
+    _SLEW,
+    *_REST,
     Declaration(
         'follow',
         'off',
@@ -335,8 +328,8 @@ FEEDFORWARD = (
     Declaration(
         'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0
     ),
-    *_listeners('listen to voltage before the first block'),
-    Declaration('window', 2.0, 'time over which the tracking error is taken', 's', 0.1, 600.0),
+    *_LISTENERS,
+    _WINDOW,
     Declaration('repetitions', 8, 'most repetitions of one ~/learn', '1', 1, 100),
     Declaration('longest', 60.0, 'longest reference that is kept for ~/learn', 's', 0.1, 3600.0),
 )

@@ -31,7 +31,17 @@ def table(name: str) -> list[list[str]]:
     body = re.search(rf'<!-- table: {name} -->\n(.*?)\n<!-- end -->', PAGE, re.S)
     assert body, f'docs/graph.md has no table {name}'
     lines = body[1].splitlines()[2:]
-    return [[c.strip().strip('`') for c in line.strip('|').split('|')] for line in lines]
+    return [[c.strip().replace('`', '') for c in line.strip('|').split('|')] for line in lines]
+
+
+def _pairs(name: str) -> list[tuple[str, str, str]]:
+    """Return each node, each of its names, and the last cell, of a table that groups them."""
+    return [
+        (node, value, last)
+        for nodes, values, *_, last in table(name)
+        for node in nodes.split(', ')
+        for value in values.split(', ')
+    ]
 
 
 def _names(cell: str) -> frozenset[str]:
@@ -43,9 +53,9 @@ TOPICS = [
     for name, kind, sent_by, read_by, qos, _ in table('topics')
 ]
 #: service, state and value of /diagnostics of each node; a value with when it is there
-SERVICES = [(node, name.removeprefix('~/')) for node, name, _ in table('services')]
-STATES = [(node, name) for node, name, _ in table('states')]
-DIAGNOSTICS = [(node, name, when) for node, name, _, _, when in table('diagnostics')]
+SERVICES = [(node, name.removeprefix('~/')) for node, name, _ in _pairs('services')]
+STATES = [(node, name) for node, name, _ in _pairs('states')]
+DIAGNOSTICS = _pairs('diagnostics')
 
 
 def rights(node: str) -> dict[str, set[str]]:
