@@ -254,7 +254,7 @@ def along_the_record(
     found = [measured(kind, size, folder) for size in sizes]
     times, peaks = [f[0] for f in found], [f[2] for f in found]
     rows = [
-        [title, length(size), f'{n:,.0f}', seconds(t), seconds(t / n), f'{peak:.0f}', '', '']
+        [title, length(size), f'{n:,.0f}', seconds(t), f'{peak:.0f}', '', '']
         for size, (t, n, peak) in zip(sizes, found, strict=True)
     ]
     if len(sizes) > 1:
@@ -264,7 +264,7 @@ def along_the_record(
 
 
 HEADS = (
-    *('work', 'record', 'samples', 'time', 'a sample', 'peak / MiB'),
+    *('work', 'record', 'samples', 'time', 'peak / MiB'),
     *('exponent', 'MiB per million samples'),
 )
 
@@ -366,8 +366,7 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
         base_model(folder)
         record = of_length(quick, folder)
         parts = [
-            'Sizes of the model and of the search, at one length of the record. Up to order m '
-            'there are m² orders, and the free run of each takes its time by its size.',
+            'At one length of the record. Up to order m there are m² orders.',
             of_thresholds(quick),
             of_orders(quick),
             f'The stage has {EFFECT}; the first candidate is that one.',

@@ -80,10 +80,9 @@ def of_models(n: int, runs: int) -> str:
         }
         inverse, prediction = take_turns(works, runs).values()
         drive = inverse.results[0]
-        times = (ratio(n / RATE / inverse.median), ratio(inverse.over(prediction)))
-        a_sample = f'{1e9 * inverse.median / n:.0f}'
-        rows.append([name, a_sample, *times, drive.passes, f'{drive.error:.2g}'])
-    heads = ['model', 'ns a sample', 'times faster than real time', 'times a prediction']
+        times = (f'{1e9 * inverse.median / n:.0f}', ratio(inverse.over(prediction)))
+        rows.append([name, *times, drive.passes, f'{drive.error:.2g}'])
+    heads = ['model', 'ns a sample', 'times a prediction']
     return markdown([*heads, 'passes', 'left, % of stroke'], rows)
 
 
@@ -91,8 +90,8 @@ def sections(quick: bool = False) -> list[tuple[str, str]]:
     """Return titles and texts."""
     n, runs = (100_000, 3) if quick else (400_000, 7)
     about = (
-        f'A raster of {n / RATE:g} s at 20 kHz, all offline: filter, passes and checks. The error '
-        'is what the inversion leaves of the model itself.'
+        f'A raster of {n / RATE:g} s at 20 kHz, offline. The inversion leaves this error of the '
+        'model itself.'
     )
     return [('Inversion of a motion', f'{about}\n\n{of_models(n, runs)}')]
 

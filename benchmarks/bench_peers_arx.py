@@ -225,23 +225,16 @@ def _text(turns: dict[str, Turn], base: str, most: int, runs: int, table: str) -
     same = {name: t for name, t in peers.items() if 'own terms' not in name}
     fastest = min(same, key=lambda name: same[name].median)
     return f"""\
-Orders na, nb = 1..{most} at a known delay, {SAMPLES:,} samples of the noise segment of
-`stage_paper`, {runs} paired turns, each with another sensor noise. All may use the first 80 %. The
-error is that of a free run over the last 20 %.
+Orders na, nb = 1..{most} at a known delay, {SAMPLES:,} samples of the noise of `stage_paper`,
+{runs} paired turns, each with another sensor noise. The last 20 % judge a free run.
 
 {table}
 
 Fastest peer over the same orders: {fastest}, {ratio(same[fastest].over(turns[base]))} times our
-time.
-
-- sippy_unipi: `system_identification` with `"ARX"`, `IC="BIC"` and our delay. Its time grows with
-  the square of the record. It also finds the delay, and has ARMAX, Box-Jenkins and subspace
-  models, which we lack.
-- SysIdentPy at every order: linear `FROLS` with `LeastSquares` and as many terms as the order has,
-  a use that it is not made for.
-- SysIdentPy with its own terms: `FROLS` over the same {2 * most} lags, one after the other. It
-  searches {2 * most} nested models instead of {most * most} orders, and takes nonlinear terms by
-  the same call."""
+time. sippy_unipi runs `system_identification` with `"ARX"`, `IC="BIC"` and our delay. SysIdentPy
+runs linear `FROLS` with `LeastSquares`: at every order, for which it is not made, or over
+{2 * most} nested models of the same lags. We lack the nonlinear terms of SysIdentPy, and
+the search for the delay and the ARMAX, Box-Jenkins and subspace models of sippy_unipi."""
 
 
 if __name__ == '__main__':

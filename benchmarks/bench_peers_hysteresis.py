@@ -300,17 +300,16 @@ def measured(quick: bool) -> str:
     return f"""\
 `{MEASURED}`: {piece.n:,} samples at {rate:g} Hz, rest, a step that rings, then a 1 Hz sine of
 full size; the last {HELD} s are held out. Errors are {FORMULA}. Ours fits everything
-before them, delay and resonance included, and predicts the whole record. The peers fit the sine
-alone ({(n_fit - begin) / rate:.1f} s from {BEGIN} s on) and predict the held-out part from its
-measured start. Sensor noise at rest, {floor:.3f} % of stroke, remains in every error.
+before them, delay and resonance included. The peers fit the sine alone
+({(n_fit - begin) / rate:.1f} s from {BEGIN} s on) and predict from the measured start.
+Sensor noise at rest, {floor:.3f} % of stroke, remains in every error.
 
 {markdown(HEADS, rows + more)}
 
 {notes}
 
-Where one loop repeats, a NARX polynomial of few terms is enough, and pysindy gives an equation
-that can be read. Both know this loop at this frequency alone; neither finds a delay or
-a resonance."""
+Where one loop repeats, a NARX polynomial of few terms is enough. The peers know this loop at this
+frequency alone, and find neither a delay nor a resonance."""
 
 
 def other_motions(quick: bool) -> str:
@@ -348,15 +347,14 @@ def other_motions(quick: bool) -> str:
     return f"""\
 `stage_dense` has forty thresholds of its own. The peers fit the triangle of growing amplitude
 ({(triangle.stop - triangle.start) / rate:.1f} s), ours the whole identification record
-({record.duration:.1f} s), dynamics and delay included. Held out: minor loops at three biases and a
-decaying triangle ({truth.duration:.1f} s), against the noise-free stage, in free run from rest.
+({record.duration:.1f} s). Held out: minor loops at three biases and a decaying triangle
+({truth.duration:.1f} s), against the noise-free stage, in free run from rest.
 
 {markdown(HEADS, rows + more)}
 
 {notes}
 
-A NARX model of few lags, or an equation in y and v alone, has no memory for turning points that
-lie further back. The plays of H are that memory."""
+A NARX model of few lags, or an equation in y and v alone, remembers no earlier turning points."""
 
 
 def sections(quick: bool = False) -> list[tuple[str, str]]:

@@ -122,15 +122,15 @@ def page(outcomes: Iterable[Outcome], command: str, load: float) -> str:
         '# Benchmarks',
         '',
         'This page shows how fast the package is and how large its errors are, beside other',
-        'libraries. The command below wrote every number.',
+        'libraries, as written by',
         '',
         f'    {command}',
         '',
         f'Machine: {machine()}. Load average before: {load:.2f}.',
         '',
-        'The works of a table ran in turns in one process, with one thread of BLAS. Times are',
-        'medians over the turns, ratios medians of the ratios turn by turn. Only ratios hold on',
-        'another machine. Errors are errors of free runs over data that were not fitted.',
+        'The works of a table ran in turns in one process, with one thread of BLAS. Times and',
+        'ratios are medians over the turns. Only ratios hold on another machine. Errors are those',
+        'of free runs over data that were not fitted.',
     ]
     for outcome in outcomes:
         if outcome.reason:
