@@ -33,7 +33,7 @@ from piezo_ident.uncertainty.prediction import half_widths
 from piezo_ident.uncertainty.weights import NOTHING
 from side_by_side import machine
 from study_records import case_records
-from study_rows import all_rows, part_of, section
+from study_rows import all_rows, part_of, section, write_csv
 from truths import Case, draw, FamilyStage
 
 #: first seed of the draw, and the group of families whose laws may be looked at
@@ -45,7 +45,7 @@ MAIN = LEVELS.index(0.9)
 WIDTHS = 'width / oracle, geometric'
 ORACLE = (
     'The oracle is, for each stage and kind, the constant half width that holds 90 %. Width / '
-    'oracle: mean half width over the mean of the oracle, % of stroke; geometric: mean ratio.'
+    'oracle: mean half width over the mean of the oracle; geometric: mean ratio.'
 )
 #: measured records and the share that is identified; the rest is predicted
 MEASURED = (('piezo_levels.csv', 0.6), ('piezo_1hz.csv', 0.86))
@@ -57,9 +57,12 @@ QUANTITIES = (
     'largest, bias / scatter'
 )
 OFF = (
-    'On the grid the reference is the truth, off the grid the fit of the same record without '
-    'noise. The noise is 1e-4 of the stroke. Without bias: around the mean of the draws.'
+    'Intervals that hold the reference [%], and scatter over stated deviation. On the grid the '
+    'reference is the truth, off the grid the fit of the same record without noise. The noise is '
+    '1e-4 of the stroke. Bias, and the least and largest of each: [coverage.csv](coverage.csv).'
 )
+#: of quantities, in the order of the page
+KINDS = ('static gain', 'loop width', 'gain', 'phase', 'modes')
 #: a kind of motion of a record, the shares inside at `LEVELS`, the mean half width at 0.9 and the
 #: constant half width that holds 90 % [% of stroke], and the share of samples that are not known
 Cell = tuple[str, tuple[float, ...], float, float, float]
@@ -262,6 +265,12 @@ def _pooled(quantities: Sequence[Quantity]) -> Iterator[tuple[object, ...]]:
         )
 
 
+def _in_short(quantities: Sequence[Quantity]) -> Iterator[tuple[object, ...]]:
+    pooled = {row[:2]: f'{row[3]}, {row[6]}' for row in _pooled(quantities)}
+    for variant in dict.fromkeys(variant for variant, _ in pooled):
+        yield variant, *(pooled.get((variant, kind), '') for kind in KINDS)
+
+
 def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) -> str:
     """Return the page."""
     groups = {
@@ -272,21 +281,22 @@ def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) ->
     heads = 'motion, stages, ' + ', '.join(f'{100 * p:g} %' for p in LEVELS)
     parts = [
         '# Coverage',
-        'Whether [bands, promises and weights](bands.md) hold on stages of families that the '
-        f'model lacks (`benchmarks/truths`, group {GROUP}), one draw of seeds from {SEED} on that '
-        'nobody had used. Two stages of three play the program `identification_loops`, the others '
-        'motion without labels. `make coverage` writes this page. This run: '
+        'This page shows whether [bands, promises and weights](bands.md) hold on stages of '
+        f'families that the model lacks (`benchmarks/truths`, group {GROUP}; seeds from {SEED} on '
+        'that nobody had used). Two stages of three play the program `identification_loops`, '
+        'the others motion without labels. `make coverage` writes this page. This run: '
         f'**{len(groups["identified"])} identified stages, {len(groups["diagnosed"])} diagnosed '
         f'ones, {len(measured)} measured records, {draws} draws of parameters**, '
         f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 40. '
         f'{machine()}.',
         '![Nominal against measured coverage by kind of motion](images/coverage.png)',
+        ORACLE,
     ]
     for what, own in groups.items():
         title = f'Prediction bands, {what} stages'
         parts.append(
             section(title, f'{heads}, {WIDTHS}, not known', _coverage(own))
-            + f'\n\n{ORACLE} Stages below 60 %: {_low(own)}.'
+            + f'\n\nStages below 60 %: {_low(own)}.'
         )
     parts.append(
         section('Bands on measured records', f'{heads}, {WIDTHS}, not known', _coverage(measured))
@@ -310,7 +320,9 @@ def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) ->
         f'## Sensor noise\n\nStated over true: median {np.median(noise or [np.nan]):.2f}; within '
         f'1.5 times of the truth: {part_of(near, len(noise))}.'
     )
-    parts.append(section(PARAMETERS, QUANTITIES, _pooled(quantities)))
+    parts.append(
+        section(PARAMETERS, f'stage and record, {", ".join(KINDS)}', _in_short(quantities))
+    )
     parts.append(OFF)
     return '\n\n'.join(parts) + '\n'
 
@@ -356,6 +368,7 @@ def main() -> None:
     of_draws = all_rows(args.kept.with_suffix('.draws.jsonl'), Draw, draws, drawn, args.processes)
     quantities = table(of_draws, draws)
     args.page.write_text(page(own, quantities, args.draws), encoding='utf-8')
+    write_csv(args.page.with_suffix('.csv'), QUANTITIES, _pooled(quantities))
     picture(own, args.picture)
 
 
