@@ -40,11 +40,8 @@ HEAD = """# Reliability
 This page lists, for whoever connects an amplifier, the attempts to break the drive, the graph and
 the files, and their results.
 
-*Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`; each study writes
-its own rows. Every row can be run again with its command, from the root of the sources, after
-`make test` (for `make crash` nothing before), with `.venv` active (`. .venv/bin/activate`).*
-
-## The table
+*Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`. Each row can be
+run again with its command, from the root of the sources, after `make test`, with `.venv` active.*
 
 """
 
@@ -54,24 +51,21 @@ TAIL = """
 Whatever arrives on `voltage`, every voltage that is *applied* is a number within the limits and no
 further from the voltage before than the slew allows. Where limits are moved, the voltage goes back
 into them at the slew. Silence ends at rest by a ramp, a new stream is joined by a ramp, a second
-publisher moves nothing.
+publisher moves nothing. `benchmarks/reliability/safety.py` has the property as code.
 
-`benchmarks/reliability/safety.py` has the property as code. The property holds while the process
-that drives the amplifier lives. Only a watchdog in the amplifier helps against SIGKILL and power
-failure ([My driver](driver.md)).
+The property holds while the process that drives the amplifier lives. Only a watchdog in the
+amplifier helps against SIGKILL and power failure ([My driver](driver.md)).
 
 ## Damaged files and kills
 
-A file that the reader of its library refuses ends in one line that names the file. SciPy reads
-MATLAB files in a process of its own, since some damage ends the process. An effect plug-in that
-cannot be imported is skipped with a warning. [Security](SECURITY.md) lists the threats that
-remain.
+A file that the reader of its library refuses ends in one line that names the file. An effect
+plug-in that cannot be imported is skipped with a warning. [Security](SECURITY.md) lists the
+threats that remain.
 
-An output is written under the name `.NAME.RANDOM.tmp` in the same folder (`.new.RANDOM.tmp` in a
-report folder) and renamed when it is whole. A process that is killed leaves such a file, which can
-be deleted, and the old output. The files of a report are put in place one by one, the page last.
-An unfinished sqlite3 bag is read from a copy in the folder for temporary files,
-`piezo_ident_bag_RANDOM`.
+An output is written as `.NAME.RANDOM.tmp` (`.new.RANDOM.tmp` in a report folder) and renamed when
+it is whole. A process that is killed leaves such a file, which can be deleted, and the old output.
+The files of a report are put in place one by one, the page last. An unfinished sqlite3 bag is read
+from a copy in the folder for temporary files, `piezo_ident_bag_RANDOM`.
 
 ## Two hosts
 
@@ -83,15 +77,15 @@ DDS finds its peers on other hosts by multicast. Both hosts need
 
 before any node starts. The file makes socket buffers of 4 MiB (raise `net.core.rmem_max` and
 `net.core.wmem_max` to as much), and has a lost packet asked for again within 10 ms. A topic keeps
-its last thousand blocks, five seconds in real time. A link that is down for longer therefore loses
+its last thousand blocks, five seconds in real time. A link that is down for longer loses
 samples, every listener says how many, and no model is made where too much is missing.
 
 ## How long is long
 
-Two hours at 20 kHz are 1.4e8 samples. Memory that grows with messages shows in two hours as in a
-week; the table has the slope. The sample clock is counted from its start, so its rounding does not
-grow (t = k/fs stays exact to 2^53 ticks, 14,000 years). A full disk, a stage that drifts, leaks of
-Fast DDS below the slope's resolution and a clock of the machine that is set are not tried here.
+Memory that grows with messages shows in two hours (1.4e8 samples) as in a week. The sample clock
+t = k/fs stays exact to 2^53 ticks, 14,000 years. A full disk, a stage that drifts, leaks of
+Fast DDS below the resolution of the slope and a clock of the machine that is set are not tried
+here.
 """
 
 

@@ -339,12 +339,14 @@ def rows_of(
     killed: list[tuple[Job, str]], starved: dict[str, list[tuple[Job, str]]]
 ) -> list[tuple[str, str, str]]:
     """Return the rows of the table."""
-    rows = []
+    counted = []
     for kind in KILLS:
         states = [state for job, state in killed if job.kind == kind]
-        counted = ', '.join(f'{n} {state}' for state, n in Counter(states).most_common())
-        bad = sum(state not in GOOD for state in states)
-        rows.append((f'SIGKILL: {kind}', f'{len(states)} kills', f'{counted}; {bad} damaged'))
+        each = ', '.join(f'{n} {state}' for state, n in Counter(states).most_common())
+        counted.append(f'{kind}: {each}')
+    bad = sum(state not in GOOD for _, state in killed)
+    result = f'the output is {"; ".join(counted)}; {bad} damaged'
+    rows = [('SIGKILL while a command works', f'{len(killed)} kills', result)]
     for what, outcomes in starved.items():
         good = 'one line, exit code 2, nothing lost, nothing left'
         bad_ones = '; '.join(f'{job.name}: {wrong}' for job, wrong in outcomes if wrong)

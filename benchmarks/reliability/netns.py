@@ -336,7 +336,8 @@ def _result(outcome: Outcome, perfect: str) -> str:
         model = 'the model of the perfect network, bit for bit'
     missing = outcome.sent - outcome.captured
     arrived = f'{missing} samples missing and reported' if missing else 'every sample arrived'
-    reason = '' if outcome.state == 'done' else f' ({outcome.message})'
+    # its cure, behind the semicolon, is for who runs the graph
+    reason = '' if outcome.state == 'done' else f' ({outcome.message.partition(";")[0]})'
     return f'{arrived}; {model}{reason}'
 
 
