@@ -230,23 +230,23 @@ SUMS = (
     'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. The '
     '[laws of the stages]({laws}) are not those of the candidates. The size of an effect is the '
     'free-run error that a refit of a sum of plays leaves on kinds of motion held out, in % of '
-    f'stroke. An effect of {COUNTS} % and more is counted. A name is false if neither the name '
-    'nor its class holds the truth. Removed: a candidate was taken out of the catalogue. Outside: '
-    'the effect is not in it.'
+    f'stroke; effects of {COUNTS} % and more count. A name is false if the name and its class '
+    'miss the truth. Removed: a candidate was taken out of the catalogue. Outside: the effect is '
+    'not in it.'
 )
 FAMILIES = (
-    'Every stage has two or three lightly damped modes and a delay of any fraction of a sample. '
-    'Rates are 10, 20 or 50 kHz, ranges 0..10, 0..100 or -20..130 V, strokes 5 to 200 um of '
-    'either sign. The noise is white, 1/f, or a converter of 10 or 12 bits. Two thirds of the '
-    "cases are labelled and follow the package's own program. The others are one stretch each "
-    'that starts anywhere. Each stage is identified from one record, diagnosed on another, and '
-    'judged on a third of other motion. An effect that would change the identified G or H sets in '
-    'behind the identification.\n\n'
+    'Every stage has two or three lightly damped modes and a delay of any fraction of a sample; '
+    'rates of 10, 20 or 50 kHz, ranges 0..10, 0..100 or -20..130 V, strokes of 5 to 200 um of '
+    'either sign; noise that is white, 1/f, or of a converter of 10 or 12 bits. Two thirds of the '
+    "cases are labelled and follow the package's own program, the others are one stretch that "
+    'starts anywhere. Each stage is identified from one record, diagnosed on another, and judged '
+    'on a third of other motion. An effect that would change the identified G or H sets in behind '
+    'the identification.\n\n'
     'The misfit of a core is the unseen error of the same stage without its effects, by forty '
     'plays with the true linear part. The size of an effect is the rms of its change of the '
     'diagnosis record, behind an offset and a gain, in % of stroke. Lines, channels and faults of '
-    'the data count whatever their size, other effects from the misfit on. A name is false if '
-    'neither the name nor its class holds the truth.'
+    'the data count whatever their size, other effects from the misfit on. A name is false if the '
+    'name and its class miss the truth.'
 )
 
 
@@ -283,26 +283,26 @@ def summary(rows: Sequence[Row]) -> str:
     lines = [
         ['nothing hidden: an effect named', share(lambda r: bool(r.effects), nothing)],
         [
-            '- no name, and two or three that may hide in the base model',
+            '- no name, some may hide in the base model',
             share(lambda r: bool(r.group), nothing),
         ],
         ['an effect that counts: its name or class', share(is_found)],
-        ['- where it follows the path of the voltage alone', found(follows_path)],
+        ['- where it follows the path of the voltage', found(follows_path)],
         ['- elsewhere', found(lambda r: not follows_path(r))],
         ['- a false name instead or beside', said('false')],
         ['- one of two', said('part')],
         ['- abstained', said('abstained')],
-        ['- no name, and it is among what may hide in the base model', said('hidden')],
+        ['- no name, it may hide in the base model', said('hidden')],
         [
-            '- its name, its class, or the class of a refit (`refitted`)',
+            '- its name, its class, or the class of a refit',
             share(lambda r: is_found(r) or refit_holds_it(r)),
         ],
         [
-            '- no name, and the class of a refit does not hold it',
+            '- no name, not in the class of a refit',
             share(lambda r: r.verdict == 'refitted' and not r.fault and not refit_holds_it(r)),
         ],
         [
-            '- where a refit of forty plays leaves the misfit at least: its name or class',
+            '- where a refit of forty plays leaves the misfit at least',
             found(lasting),
         ],
         [
@@ -351,15 +351,17 @@ def stage_of(row: Row) -> str:
 def by(title: str, name: Callable[[Row], str], rows: Sequence[Row]) -> str:
     """Return a section of outcomes and errors, a line for each name that is not empty."""
     names = sorted({name(r) for r in rows} - {''})
+    # the misfit of a sum of plays is the same for all
+    errors = ['misfit', 'centred_before', 'centred_after'][len({r.misfit for r in rows}) == 1 :]
     lines = []
     for own in ([r for r in rows if name(r) == key] for key in names):
-        sizes = (
-            [getattr(r, e) for r in own] for e in ('misfit', 'centred_before', 'centred_after')
-        )
+        sizes = ([getattr(r, e) for r in own] for e in errors)
         medians = [f'{np.nanmedian(x):.3f}' if np.isfinite(x).any() else '' for x in sizes]
         lines.append([name(own[0]), len(own), counts_of(map(outcome, own), OUTCOMES), *medians])
-    heads = f'{title.lower()}, cases, outcomes, misfit, unseen error before, after'
-    return section(title, heads, lines)
+    misfit = 'misfit, ' * (len(errors) == 3)
+    return section(
+        title, f'{title.lower()}, cases, outcomes, {misfit}unseen error before, after', lines
+    )
 
 
 CASE_HEADS = (
