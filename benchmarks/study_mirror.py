@@ -64,15 +64,14 @@ This page shows, on a measured stage of three axes, how an effect inside the mec
 The fine steering mirror of CubeSpec has three piezo actuators and three displacement sensors. The
 records are the training part of a public benchmark: M. Floren, KU Leuven,
 [doi:10.5281/zenodo.19591136](https://doi.org/10.5281/zenodo.19591136), CC BY 4.0; none of it is
-part of this project. Orthogonal multisines of random phase up to 3 kHz drive all three voltages at
-once, at 100, 200 and 300 mV rms. Each amplitude has six realisations of 8192 samples at 6.4 kHz,
-two periods in steady state.
+part of this project. Orthogonal multisines up to 3 kHz drive all three voltages at once, at 100,
+200 and 300 mV rms, in six realisations of 8192 samples at 6.4 kHz, two periods in steady state.
 
 **Held out**: realisations {held_out} (from zero) at each amplitude; no fit and no decision uses
 them. The form of the laws was found with their errors in view; the test part of the benchmark,
 which is not used here, is the one clean judge.
 
-## What a linear model lacks
+## The verdict
 
     found = pi.identify(records)
     settings = pi.DiagnosisSettings(effects=('loop_hysteresis',))
@@ -92,10 +91,10 @@ outputs and realisations held out. The published rows are pooled over all output
 
 ![Spectra of the motion and of the errors](images/mirror_residual.png)
 
-*Spectra of the outputs held out, of the errors of two models, and of the noise between periods:
-rms in bands of 25 Hz, in % of rms(y).*
+*Outputs held out, errors of two models, and noise between periods: rms in bands of 25 Hz, in % of
+rms(y).*
 
-## What was added
+## The law that was added
 
     x(k+1) = A x(k) + B u(k) + E p(k)
     y(k)   = C x(k) + D u(k) + H p(k)
@@ -106,12 +105,11 @@ The linear part has {order} states. Nine signals z act back on the mechanics as 
 - three **soften** the stage: p = z (s - 1), where s is the rms of the three, followed with a time
   constant of {memory:.0f} samples ({memory_ms:.0f} ms); they begin as the extension of the
   actuators, G(0)^-1 y;
-- three are sums of **plays** of five shared thresholds, beginning from the extension too;
-- three are sums of plays, beginning from the voltages.
+- six are sums of **plays** of five shared thresholds; three begin as the extension, three as the
+  voltages.
 
 The fit by the error in free run ends at mixtures of motion and voltage, {parameters} numbers in
-all. Piezo ceramics soften and lose more energy the more they are driven. The data show the effect
-and not its cause: a joint that slips would look alike.
+all. The data show the effect and not its cause: a joint that slips would look alike.
 
 The model is stable at each level between {low:.2f} and {high:.2f}, the plays at rest; beyond them
 the softening stays.
@@ -121,7 +119,7 @@ the softening stays.
 ![Frequency and damping of modes against the voltage](images/mirror_modes.png)
 
 *Modes that stand alone, from a modal model refined at each amplitude: dots for the measured
-records, lines for the answers of the named model.*
+records, lines for the named model.*
 
 | mode / Hz | frequency at 100 / 200 / 300 mV | of the model | damping in % | of the model |
 |---|---|---|---|---|
@@ -136,7 +134,7 @@ damping of some modes rises.
 
 All others differ by {usual[0]:.1f} to {usual[1]:.1f} % between their periods.
 
-## What is left
+## The remaining error
 
 Noise is {noise} % of rms(y) in one period at 100 / 200 / 300 mV. The rest of the error repeats
 from period to period and grows nearly in proportion to the amplitude. No law of this page lowers
