@@ -345,13 +345,12 @@ def springs(seed: int) -> list[tuple[str, float, float, float]]:
 TEXT = """\
 # Any record
 
-This page tells whoever has a record without labels how much a model errs that was
-identified from it, or from a pair, beside four peers of twenty lines each. The
-simulated stages have another hysteresis than the model, two or three light modes and a
-delay of any part of a sample. A record has 6 s at 10 kHz, noise of 0.005 to 0.05 % of
-stroke. The error is 100 rms(y - y_hat) / (max y - min y) in free run, mean included, on
-another realisation of the same kind of motion. `make any-record` writes this page (seeds
-{seeds}).
+This page shows how much a model errs that was identified from a record without labels, or
+from a pair, beside four peers of twenty lines each. The simulated stages have another
+hysteresis than the model, two or three light modes and a delay of any part of a sample. A
+record has 6 s at 10 kHz, noise of 0.005 to 0.05 % of stroke. The error is
+100 rms(y - y_hat) / (max y - min y) in free run on another realisation of the motion.
+`make any-record` writes this page (seeds {seeds}).
 
 Of {cases} cases {good} err at most 1.05 times as much as the best peer; the median is {median:.2f}
 times, the worst {worst:.2f}. An identification took {seconds:.1f} s of processor time (median).

@@ -61,10 +61,10 @@ TEXT = """\
 This page tells whoever runs a stage for hours what the live model makes of a stage that changes.
 `make stays-right` made it.
 
-Each of {stages} simulated stages follows laws that the model does not have. Nobody had looked at
-these stages while the live model was built. A stage was identified from one record and diagnosed
-on another. Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle whose corners
-are round. One thing about it changed {at:g} s later:
+Each of {stages} simulated stages follows laws that the model does not have; nobody had looked at
+them while the live model was built. A stage was identified from one record and diagnosed on
+another. Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle with round
+corners. One thing about it changed {at:g} s later:
 
 - **creep amid motion**: it was at the highest voltage for ten seconds, until half a second before
   the scan;
@@ -88,9 +88,9 @@ before:
 - **and its drift**: `estimate` with `observe_drift`;
 - **adaptation**: `estimate` with `adapt` = `hysteresis`.
 
-The error is the rms difference to the displacement without noise, in % of the span of the stage.
-The mean is included. *After the change* is from {judged:g} to {rest:g} s behind it. The last
-two columns of the first table are ratios to the best of the last four ways.
+The error is the rms difference to the displacement without noise, mean included, in % of the span
+of the stage. *After the change* is from {judged:g} to {rest:g} s behind it. The last two columns
+of the first table are ratios to the best of the last four ways.
 
 {after}
 
@@ -98,23 +98,22 @@ two columns of the first table are ratios to the best of the last four ways.
 
 ## Without a sensor
 
-The sensor is cut off {rest:g} s after the change. The columns tell the error over the next 1 s and
-10 s: a copy of the sensor would be worth nothing there.
+The sensor is cut off {rest:g} s after the change. The columns are the error over the next 1 s and
+10 s.
 
 {cut}
 
-## What it claims
+## The claimed deviations
 
 How often the error lies within {nine} standard deviations that the observer claims, in %: nine of
 ten errors of a normal law do.
 
 {claims}
 
-What the model lacks is no part of the estimate: by default a gain, loop or mode that changed stays
-an error. It is then that the node advises to identify again, or to follow the gain, or to adapt.
-A load is neither gain nor hysteresis: no way here follows it. What follows the drift of the gain
-has no lag behind a ramp. Amid strong creep of earlier motion the adaptation errs more in its first
-seconds than the observer alone: it takes creep for gain.
+By default a gain, loop or mode that changed stays an error: then the node advises to identify
+again, to follow the gain, or to adapt. No way here follows a load. Amid strong creep of earlier
+motion the adaptation takes creep for gain, and errs more in its first seconds than the observer
+alone.
 """
 
 

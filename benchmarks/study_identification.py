@@ -97,19 +97,18 @@ def thresholds_table(stages: dict[str, SimulatedStage]) -> str:
 TEXT = """\
 # How well simulated stages are identified
 
-This page shows how near the three steps come to known stages. It was made by
-`make study-identification`. The error is 100 rms(y - y_hat) / (max y - min y) of a free
-run against the stage without noise. The motions were not fitted: sines
-v = 5 + 5 sin(2 pi f t) in steady state, and minor loops at three biases with a decaying
-triangle.
+This page shows how near the three steps come to known stages (`make study-identification`).
+The error is 100 rms(y - y_hat) / (max y - min y) of a free run against the stage without
+noise, on motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and
+minor loops at three biases with a decaying triangle.
 
 Python {python}, {versions}
 
 ## Twenty seeds and three noise levels, the paper's stage
 
 The truth lies on the thresholds of the model, which flatters the result. The converters have
-16 bits. The worst error is the largest over the six sines and all seeds. "Swarm" counts the seeds
-whose loss was within 1 % of bounded least squares. The swarm made the models.
+16 bits. The worst error is that over six sines and all seeds. The swarm made the models; "swarm"
+counts the seeds whose loss was within 1 % of bounded least squares.
 
 {seeds}
 

@@ -56,11 +56,10 @@ HEADS = ('scaled voltage', 'identified', 'refined', f'after {REPETITIONS} repeti
 TEXT = """\
 # How near a stage comes to a wanted motion
 
-This page tells whoever wants to move a stage without a controller what the inverse of a model is
-worth. `make track` made it. Each simulated stage follows laws that the model does not have. Its
-sensor has no noise, but the steps of its converter, up to 0.04 % here. The stage was identified
-from one record and diagnosed on another, with an effect in it that was not declared. Then it had
-to follow {motions} motions.
+This page gives the tracking errors of a stage without a controller, under the inverse of a model.
+`make track` made it. Each simulated stage follows laws that the model does not have. Its sensor
+has the steps of its converter, up to 0.04 % here. The stage was identified from one record and
+diagnosed on another, with an undeclared effect. Then it had to follow {motions} motions.
 
 ![Tracking errors of each stage, four ways](images/tracking.png)
 
@@ -73,10 +72,9 @@ to follow {motions} motions.
   corrected by `pi.Learning`.
 
 The error is {formula}: y is the wanted
-motion, y_hat the measured one. Displacement is counted from where the stage rests. *Error of the
-model* is that of the refined model on data that it was not fitted to. Each motion begins at rest,
-with a ramp, and spans {part:g} % of the slow range: sines, a triangle, a raster of {lines:g} Hz
-whose lines rise.
+motion, y_hat the measured motion, from rest. *Error of the model* is the error of the refined
+model on data held out. Each motion begins at rest, with a ramp, and spans {part:g} % of the slow
+range: sines, a triangle, a raster of {lines:g} Hz whose lines rise.
 
 {table}
 

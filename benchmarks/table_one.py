@@ -70,7 +70,7 @@ segments:
 TEXT = """\
 # Table I, with a third row
 
-This page adds to Table I of the paper what a diagnosis gains. `make table-one` made it. Errors are
+This page adds the gain of a diagnosis to Table I of the paper (`make table-one`). Errors are
 free-run errors, rms(y - y_hat) / (max y - min y) in %, of v = 5 + 5 sin(2 pi f t) in steady state.
 The simulated stage has rate dependence and creep, by other laws than the candidates
 (`benchmarks/truths/table_one.py`).

@@ -82,11 +82,12 @@ segments:
 TEXT = """\
 # A raster of a simulated scanner
 
-`make study-xy` made this page. The model does not have the laws of this simulated scanner.
-The first axis is a Preisach operator with an uneven density and a mode at 190 Hz. The second axis
-obeys the law of Bouc and Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either
-axis moves the other by {cross:g} %, through its own mode and one of the guide at 310 Hz. The axes
-are sampled at {rate:g} kHz; the sensors have {noise:g} % of noise.
+This page shows how well the raster of a simulated scanner is predicted and tracked
+(`make study-xy`). The model does not have the laws of the scanner: the first axis is a Preisach
+operator with an uneven density and a mode at 190 Hz. The second axis obeys the law of Bouc and
+Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either axis moves the other by
+{cross:g} %, through its own mode and one of the guide at 310 Hz. The rate is {rate:g} kHz; the
+sensors have {noise:g} % of noise.
 
 One record of {seconds:.0f} s taught the model. Each axis played its three steps while the other
 one rested ({learn:.0f} s, `pi.identify`); then both moved ({move:.0f} s, `pi.diagnose`). The
@@ -99,7 +100,7 @@ the range, for {length:g} s.
 
 ![Errors along the raster](images/xy_study.png)
 
-*What the refined model errs by along the raster: prediction (top) and tracking (below).*
+*Errors of the refined model along the raster: prediction (top) and tracking (below).*
 
 The error is {formula}, the zero of the sensor included. *Predicted* is the free run from the
 voltages. *Tracked* is open loop: the scanner under the voltages of `pi.invert`, against the
