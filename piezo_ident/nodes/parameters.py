@@ -119,13 +119,9 @@ EXCITATION = (
         read_only=True,
     ),
     _AXES,
-    Declaration(
-        'in_turn', False, 'whether the axes play the program one after the other, not at once'
-    ),
+    Declaration('in_turn', False, 'whether the axes play one after the other'),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
-    Declaration(
-        'rate_factor', 1.0, 'how many times faster than real time blocks are sent', '1', 0.1, 4.0
-    ),
+    Declaration('rate_factor', 1.0, 'speed of the stream, over real time', '1', 0.1, 4.0),
     *_LIMITS,
     *_REST,
     *_LISTENERS,
@@ -148,7 +144,7 @@ STAGE = (
     Declaration(
         'silence',
         0.5,
-        'time without a block after which the stage is ramped to rest',
+        'time without a block that ends a stream',
         's',
         0.01,
         3600.0,
@@ -175,21 +171,15 @@ IDENTIFIER = (
     Declaration(
         'excitation_limit',
         20.0,
-        'how long ~/run waits for a sign of the excitation, or of the stage',
+        'longest wait of ~/run for the excitation and the stage',
         's',
         0.5,
         3600.0,
     ),
     Declaration('model', '', 'file of a model for ~/diagnose; empty: that identified here'),
-    Declaration(
-        'sweeps_program', 'diagnosis', 'program that ~/diagnose asks for to have many motions'
-    ),
-    Declaration(
-        'holds_program', 'holds', 'program that ~/diagnose asks for to have holds after steps'
-    ),
-    Declaration(
-        'requests', 2, 'how often one ~/diagnose may ask the excitation for more', '1', 0, 10
-    ),
+    Declaration('sweeps_program', 'diagnosis', 'program of ~/diagnose for many motions'),
+    Declaration('holds_program', 'holds', 'program of ~/diagnose for holds after steps'),
+    Declaration('requests', 2, 'most programs that one ~/diagnose asks for', '1', 0, 10),
     _AXES,
     Declaration(
         'channels',
@@ -209,7 +199,7 @@ MODEL = (
     Declaration(
         'warn_ratio',
         3.0,
-        'live error over that at identification from which to identify again',
+        'ratio of live error and error at identification that calls for another identification',
         '1',
         1.0,
         1000.0,
@@ -227,17 +217,17 @@ MODEL = (
     Declaration(
         'horizon',
         HORIZON,
-        'by how much older than an estimate the displacement is that it uses',
+        'least age of the displacement that an estimate uses',
         'samples',
         1,
         100_000,
     ),
-    Declaration('observe_gain', False, 'whether the estimate follows the gain of the stage, too'),
-    Declaration('observe_drift', False, 'the same for a gain that drifts'),
+    Declaration('observe_gain', False, 'whether the estimate follows the gain'),
+    Declaration('observe_drift', False, 'whether the estimate follows a drift of the gain'),
     Declaration(
         'adapt',
         'off',
-        'what the estimate learns slowly: nothing, the gain, or the hysteresis and creep, too',
+        'what the estimate learns: nothing, the gain, or the hysteresis and creep, too',
         choices=('off', 'gain', 'hysteresis'),
     ),
     Declaration('output', '', 'file into which ~/save writes what was learnt; empty: none'),
@@ -278,8 +268,7 @@ RECORDER = (
     Declaration(
         'max_bag_size',
         0,
-        'size from which the next part of the recording is begun, in a folder with a number; 0: '
-        'one bag without end',
+        'size of a part of the recording, in a folder with a number; 0: one bag',
         'bytes',
         0,
         10**15,
@@ -291,7 +280,7 @@ RECORDER = (
 
 PLAYER = (
     Declaration('bag', '', 'bag to replay'),
-    Declaration('rate', 1.0, 'how many times faster than it was recorded', '1', 0.1, 4.0),
+    Declaration('rate', 1.0, 'speed over that of the recording', '1', 0.1, 4.0),
     Declaration(
         'topics',
         ('voltage', 'displacement'),
@@ -309,7 +298,7 @@ FEEDFORWARD = (
     Declaration(
         'preview',
         0.02,
-        'time by which the stage follows the reference later, to know it ahead',
+        'time by which the stage follows the reference later',
         's',
         1e-5,
         10.0,
@@ -321,13 +310,10 @@ FEEDFORWARD = (
     Declaration(
         'follow',
         'off',
-        'what the voltage makes up for as the displacement tells: nothing, offset and creep, or '
-        'the gain of the stage, too',
+        'corrections by the displacement: none, offset and creep, or the gain, too',
         choices=('off', 'offset', 'gain'),
     ),
-    Declaration(
-        'silence', 0.5, 'time without a block after which a reference has ended', 's', 0.05, 3600.0
-    ),
+    Declaration('silence', 0.5, 'time without a block that ends a reference', 's', 0.05, 3600.0),
     *_LISTENERS,
     _WINDOW,
     Declaration('repetitions', 8, 'most repetitions of one ~/learn', '1', 1, 100),
