@@ -58,8 +58,8 @@ HEADS = (
 TEXT = """\
 # It stays right
 
-This page tells whoever runs a stage for hours what the live model makes of a stage that changes.
-`make stays-right` made it.
+This page gives the errors of the live model on stages that change while they run
+(`make stays-right`).
 
 Each of {stages} simulated stages follows laws that the model does not have; nobody had looked at
 them while the live model was built. A stage was identified from one record and diagnosed on
@@ -88,9 +88,9 @@ before:
 - **and its drift**: `estimate` with `observe_drift`;
 - **adaptation**: `estimate` with `adapt` = `hysteresis`.
 
-The error is the rms difference to the displacement without noise, mean included, in % of the span
-of the stage. *After the change* is from {judged:g} to {rest:g} s behind it. The last two columns
-of the first table are ratios to the best of the last four ways.
+The error is the rms difference to the displacement free of noise, in % of the span of the stage,
+mean included. It is taken from {judged:g} to {rest:g} s after the change. The last two columns of
+the first table are ratios to the best of the last four ways.
 
 {after}
 

@@ -215,29 +215,28 @@ OUTCOMES = ('named', 'class', 'part', 'hidden', 'abstained', 'small', 'none', 'f
 PURPOSES = {
     True: (
         '# How often the diagnosis is right',
-        'This page tells whoever must trust a verdict how often it was right on simulated sums of '
-        'plays with an effect. [The second study](diagnosis_study_foreign.md) has other '
-        'hysteresis.',
+        'This page counts verdicts on simulated sums of plays with an effect. '
+        '[The second study](diagnosis_study_foreign.md) has other hysteresis.',
     ),
     False: (
         '# How often the diagnosis is right on stages of another family',
-        'This page tells whoever must trust a verdict how often it was right on simulated stages '
-        'with other families of hysteresis than sums of plays.',
+        'This page counts verdicts on simulated stages with other families of hysteresis than '
+        'sums of plays.',
     ),
 }
 SUMS = (
-    'Every stage is identified from the 15.5 s of `program_identification.yaml`, diagnosed on a '
-    'record of 17 s, and judged on 12 s of other frequencies, amplitudes and holds. The '
-    '[laws of the stages]({laws}) are not those of the candidates. The size of an effect is the '
-    'free-run error that a refit of a sum of plays leaves on kinds of motion held out, in % of '
-    f'stroke; effects of {COUNTS} % and more count. A name is false if the name and its class '
+    'Every stage is identified from the 15.5 s of `program_identification.yaml`, and diagnosed on '
+    'a record of 17 s. 12 s of other frequencies, amplitudes and holds judge it. The '
+    '[laws of the stages]({laws}) differ from the candidates. The size of an effect is the '
+    'free-run error that a refit of a sum of plays leaves on kinds of motion held out [% of '
+    f'stroke]. Effects of {COUNTS} % and more count. A name is false if the name and its class '
     'miss the truth. Removed: a candidate was taken out of the catalogue. Outside: the effect is '
     'not in it.'
 )
 FAMILIES = (
-    'Every stage has two or three lightly damped modes and a delay of any fraction of a sample; '
-    'rates of 10, 20 or 50 kHz, ranges 0..10, 0..100 or -20..130 V, strokes of 5 to 200 um of '
-    'either sign; noise that is white, 1/f, or of a converter of 10 or 12 bits. Two thirds of the '
+    'Every stage has two or three lightly damped modes and a delay of any fraction of a sample. '
+    'Rates are 10, 20 or 50 kHz, ranges 0..10, 0..100 or -20..130 V, strokes 5 to 200 um of '
+    'either sign. The noise is white, 1/f, or of a converter of 10 or 12 bits. Two thirds of the '
     "cases are labelled and follow the package's own program, the others are one stretch that "
     'starts anywhere. Each stage is identified from one record, diagnosed on another, and judged '
     'on a third of other motion. An effect that would change the identified G or H sets in behind '

@@ -98,9 +98,9 @@ TEXT = """\
 # How well simulated stages are identified
 
 This page shows how near the three steps come to known stages (`make study-identification`).
-The error is 100 rms(y - y_hat) / (max y - min y) of a free run against the stage without
-noise, on motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and
-minor loops at three biases with a decaying triangle.
+The error is 100 rms(y - y_hat) / (max y - min y) of a free run against the stage free of
+noise. The held-out motions are sines v = 5 + 5 sin(2 pi f t) in steady state, and minor loops
+at three biases with a decaying triangle.
 
 Python {python}, {versions}
 

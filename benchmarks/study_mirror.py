@@ -65,7 +65,8 @@ The fine steering mirror of CubeSpec has three piezo actuators and three displac
 records are the training part of a public benchmark: M. Floren, KU Leuven,
 [doi:10.5281/zenodo.19591136](https://doi.org/10.5281/zenodo.19591136), CC BY 4.0; none of it is
 part of this project. Orthogonal multisines up to 3 kHz drive all three voltages at once, at 100,
-200 and 300 mV rms, in six realisations of 8192 samples at 6.4 kHz, two periods in steady state.
+200 and 300 mV rms. Each amplitude has six realisations of 8192 samples at 6.4 kHz, two periods in
+steady state.
 
 **Held out**: realisations {held_out} (from zero) at each amplitude; no fit and no decision uses
 them. The form of the laws was found with their errors in view; the test part of the benchmark,

@@ -71,10 +71,10 @@ diagnosed on another, with an undeclared effect. Then it had to follow {motions}
 - **after {repetitions} repetitions**: the best of the run above and {repetitions} more, each
   corrected by `pi.Learning`.
 
-The error is {formula}: y is the wanted
-motion, y_hat the measured motion, from rest. *Error of the model* is the error of the refined
-model on data held out. Each motion begins at rest, with a ramp, and spans {part:g} % of the slow
-range: sines, a triangle, a raster of {lines:g} Hz whose lines rise.
+The error is {formula}. Here y is the wanted
+motion, and y_hat the measured motion, from rest. The column "error of the model" is the error of
+the refined model on data held out. The motions are sines, a triangle, and a raster of {lines:g} Hz
+whose lines rise. Each begins at rest, with a ramp, and spans {part:g} % of the slow range.
 
 {table}
 
