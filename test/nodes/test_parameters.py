@@ -18,9 +18,9 @@ def row(d):
     """Return the row of a declaration in docs/graph.md."""
     value = ', '.join(d.default) if isinstance(d.default, tuple) else str(d.default)
     unit = f' {d.unit}' if d.unit not in ('', '1') else ''
-    span = f'{d.low:g} .. {d.high:g}' if d.low is not None else ' or '.join(d.choices)
+    about = f'{d.description}: {" or ".join(d.choices)}' if d.choices else d.description
     fixed = ' (read-only)' if d.read_only else ''
-    return [d.name, f'{value}{unit}', span, f'{d.description}{fixed}']
+    return [d.name, f'{value}{unit}', f'{about}{fixed}']
 
 
 @pytest.mark.parametrize('node', NODES)
