@@ -32,7 +32,7 @@ import sys
 import tempfile
 import time
 
-from side_by_side import machine
+from side_by_side import machine, PEERS
 
 HERE = Path(__file__).resolve().parent
 #: benchmarks in the order of the page; others follow by name
@@ -126,7 +126,7 @@ def page(outcomes: Iterable[Outcome], command: str, load: float) -> str:
         '',
         f'    {command}',
         '',
-        f'Machine: {machine()}. Load average before: {load:.2f}.',
+        f'Machine: {machine(PEERS)}. Load average before: {load:.2f}.',
         '',
         'The works of a table ran in turns in one process, with one thread of BLAS. Times and',
         'ratios are medians over the turns. Only ratios hold on another machine. Errors are those',

@@ -25,10 +25,11 @@ from typing import Any
 
 import numpy as np
 
-#: whose versions a page names, where they are installed
-LIBRARIES = (
-    *('numpy', 'scipy', 'numba', 'llvmlite', 'rosbags', 'sippy_unipi', 'sysidentpy', 'pysindy'),
-    *('scikit-learn', 'pyswarms', 'control', 'dask', 'distributed'),
+#: whose versions a page names, where they are installed; and those of the page with the peers
+LIBRARIES = ('numpy', 'scipy', 'numba')
+PEERS = (
+    *('llvmlite', 'rosbags', 'sippy_unipi', 'sysidentpy', 'pysindy', 'scikit-learn', 'pyswarms'),
+    *('control', 'dask', 'distributed'),
 )
 
 
@@ -123,8 +124,8 @@ def versions(*names: str) -> str:
     return ', '.join(found)
 
 
-def machine() -> str:
-    """Return what is being measured on."""
+def machine(libraries: Sequence[str] = ()) -> str:
+    """Return what is being measured on; further libraries may be named."""
     name, memory = platform.processor() or platform.machine(), ''
     try:
         lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
@@ -137,7 +138,7 @@ def machine() -> str:
         pass
     return (
         f'{os.cpu_count()} cores of {name}{memory}, {platform.system()} {platform.release()}; '
-        f'Python {platform.python_version()}, {versions("piezo_ident", *LIBRARIES)}'
+        f'Python {platform.python_version()}, {versions("piezo_ident", *LIBRARIES, *libraries)}'
     )
 
 
