@@ -226,8 +226,8 @@ PURPOSES = {
 }
 SUMS = (
     'Every stage is identified from the 15.5 s of `program_identification.yaml`, and diagnosed on '
-    'a record of 17 s. 12 s of other frequencies, amplitudes and holds judge it. The '
-    '[laws of the stages]({laws}) differ from the candidates. The size of an effect is the '
+    'a record of 17 s. A record of 12 s with other frequencies, amplitudes and holds judges it. '
+    'The [laws of the stages]({laws}) differ from the candidates. The size of an effect is the '
     'free-run error that a refit of a sum of plays leaves on kinds of motion held out [% of '
     f'stroke]. Effects of {COUNTS} % and more count. A name is false if the name and its class '
     'miss the truth. Removed: a candidate was taken out of the catalogue. Outside: the effect is '
