@@ -3,6 +3,7 @@
 
 """A stage of two axes that changed, on the graph: one axis creeps, one moves 3 % more."""
 
+import itertools
 import re
 
 from axes_scanner import answer, AXES, creeping, grown, moving, RATE
@@ -126,15 +127,18 @@ def test_a_motion_of_both_axes_is_repeated_and_learnt(lab, tmp_path):
     waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 2.0)])
     scan(lab, stage, np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves))
 
-    def done(since):
-        return [s for s in lab.statuses('feedforward')[since:] if s['state'] in ('done', 'failed')]
+    def done(state, since=0):
+        """Return the ends told behind a state; those of a state before may come late."""
+        told = lab.statuses('feedforward')[since:]
+        behind = itertools.dropwhile(lambda s: s['state'] != state, told)
+        return [s for s in behind if s['state'] in ('done', 'failed')]
 
-    lab.wait(lambda: done(0), 'the end of the reference', meanwhile=stage)
+    lab.wait(lambda: done('tracking'), 'the end of the reference', meanwhile=stage)
     since, sent = len(lab.statuses('feedforward')), stage.v.shape[1]
     ok, said = lab.call('feedforward/learn')
     assert ok and '1 s, is repeated' in said, said
-    lab.wait(lambda: done(since), 'the end of learning', meanwhile=stage)
-    told = done(since)[0]['text']
+    lab.wait(lambda: done('learning', since), 'the end of learning', meanwhile=stage)
+    told = done('learning', since)[0]['text']
     best, first = (float(x) for x in re.findall(r'([0-9.e-]+) %? ?(?:of|in)', told))
     assert first > 1.0 and best < 0.1 * first, told
     v = stage.v[:, sent:]
