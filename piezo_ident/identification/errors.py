@@ -34,8 +34,8 @@ class Prediction:
     """
     Free run of a model, and of its hysteresis alone, over a run [m].
 
-    If the memory at the start is estimated, the samples of the estimate are no test, so `judged`
-    leaves them out.
+    `judged` leaves out the samples that estimate an unknown memory at the start, because they
+    cannot test the model.
     """
 
     run: Run
@@ -53,7 +53,8 @@ def fitted_memories(runs: Sequence[Run], model: StageModel) -> Memories:
     """
     Estimate the unknown memories at the starts of runs; runs that share a key have none.
 
-    The steps fit them with plays of their own, beside which they may be off by 3 % of stroke.
+    The memories of the three steps belong to temporary plays.  With the plays of the model they
+    may be off by 3 % of stroke.
     """
     keys = [key_of(run) for run in runs]
     starts = {
@@ -70,7 +71,7 @@ def predictions_of(
     memories: Memories | None = None,
     offsets: Mapping[tuple[str, float], float] | None = None,
 ) -> list[Prediction]:
-    """Simulate each run freely; a memory at the start that is not given is estimated."""
+    """Simulate each run freely; estimate its memory at the start if `memories` lacks it."""
     static, predictions = model.without_dynamics(), []
     for run in runs:
         start: StartLike = (memories or {}).get(key_of(run))
@@ -129,7 +130,8 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
     """
     Estimate the noise floor from the residuals of all runs.
 
-    A reading that rests on one step q of the converter hides its rounding, of q / sqrt(12).
+    The floor is at least q / sqrt(12), the rounding of a converter with steps of q.  Readings that
+    rest on one step hide this rounding.
     """
     parts = [
         ResidualPart(p.run.record, p.run.piece, p.run.piece.y - p.y_hat, p.run.use)
@@ -143,7 +145,7 @@ def noise_floor_of(predictions: Sequence[Prediction]) -> NoiseFloor:
 
 
 def with_fine_plays(model: StageModel, excerpts: Sequence[Excerpt]) -> StageModel:
-    """Refit H with many plays: a few err on small loops, and thereby on fast motion."""
+    """Refit H with many plays, because few plays err on small loops, hence on fast motion."""
     swing = max(e.swing for e in excerpts)
     r = fine_thresholds(swing, swing / 10.0)
     R = factorise(excerpts, r, model.dynamics, model.delay)
@@ -206,8 +208,8 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     """
     Tell whether small motion has another mean level than the triangles predict.
 
-    Small loops of a stage that is not a sum of plays do not close: steps and noise drift towards
-    the middle of the large loop.  A triangle does not show this drift.
+    If a stage is not a sum of plays, its small loops stay open: under steps and noise the
+    displacement drifts towards the middle of the large loop.  A triangle hides this drift.
     """
     for run in runs:
         e = _residual(model, run)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Identify records without labelled segments: a list of starts, one free-run fit, one comparison.
+Identify records without labelled segments: fit delay, dynamics and hysteresis together.
 
-The search works on at most `MOST` samples.  Its result is fitted to all samples that are not held
-out, and judged by the held-out samples.  Finally it is fitted to all samples.  `make any-record`
-compares the result with other programs.
+A search on at most `MOST` samples fits many candidates and chooses one.  The chosen candidate is
+then fitted to all samples that are not held out, and the held-out samples judge this fit.  The
+final model is fitted to all samples.  `make any-record` compares it with other programs.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.readings.suspicions import rises_first
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
-#: most samples of records that the search simulates as a whole, most samples of the windows that
-#: it takes from longer records, and most rows of the final fits (time: a search of windows takes
-#: half a minute)
+#: The search simulates records of at most `MOST` samples as a whole.  From longer records it takes
+#: windows of at most `WINDOWED` samples together, and then lasts half a minute.  The final fits
+#: have at most `MOST_ROWS` rows
 MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
 #: number of blocks of all stretches together (taste: a fifth of the blocks is held out in turn)
 BLOCKS = 50
 #: number of plays of H, including the play at r = 0, unless the user sets it
 PLAYS = 40
-#: range of voltages of H, normalised: similar motion may leave the range slightly (taste: a
-#: seventh), and densities end with this span
+#: voltages for which H is fitted, normalised.  The densities of H end with this span.  It is wider
+#: than 0 .. 1, because similar motion may leave the range slightly (taste: a seventh)
 SPAN = (-0.15, 1.15)
 #: the first 1/`RINGING` of a window is not fitted, as earlier motion may still ring there (taste)
 RINGING = 20
@@ -240,9 +240,9 @@ def held_out_stretches(u: Array, rate: float, n_held: int) -> Mask:
     Mark the samples of a normalised voltage u that are held out, shape (n,).
 
     `n_held` samples are held out in a few stretches spread over the run.  The last stretch lies at
-    the end if possible, because only the end shows drift.  All stretches move towards the
-    beginning if the rest would otherwise lack most of the range, or of the energy of a frequency
-    band: a record that ends in its only chirp would lose the motion that identifies G.
+    the end if possible, because only the end shows drift.  The fitted samples must keep the share
+    `STAYS` of the range and of the energy of each frequency band: without its only chirp, a record
+    cannot identify G.  If they lose more, all stretches move towards the beginning.
     """
     n, size = u.size, n_held // STRETCHES
     ends = np.linspace(0, n, STRETCHES + 1).astype(int)[1:]

@@ -35,8 +35,8 @@ class FreeRunFits:
     """
     Fits of unlabelled records: `judged` without the held-out samples, `last` to all samples.
 
-    `chosen` are the fitted runs, `parts` the samples of each that were not held out, and `best`
-    is the one of the compared candidates that was chosen.
+    `chosen` holds the fitted runs, and `parts` the samples of each run that were not held out.
+    `best` is the chosen candidate of the compared `candidates`.
     """
 
     chosen: Sequence[Run]
@@ -56,7 +56,7 @@ def outcome_of(
     model, tested = (_model(each, rate, scaling) for each in (stage, judged))
     low, high = (float(f([f(run.u) for run in chosen])) for f in (np.min, np.max))
     keys = [key_of(run) for run in runs]
-    # two runs with the same key could not be told apart, so they keep no start
+    # a start is found again by its key, so runs that share a key keep no start
     own = {key_of(run): i for i, run in enumerate(chosen) if keys.count(key_of(run)) == 1}
     memories = {key: _start(stage, i, chosen[i], model) for key, i in own.items()}
     at_test = {key: _start(judged, i, chosen[i], tested) for key, i in own.items()}
@@ -155,7 +155,7 @@ def _delay_result(fits: FreeRunFits, settings: Settings, rate: float, band: floa
         return DelayResult(settings.delay, float('inf'), 'given')
     if d == 0 and fits.last.stage.dynamics.is_static:
         return DelayResult(0, float('inf'), 'none')
-    # a drive that ends at f leaves an uncertainty of half a period of f
+    # a drive that ends at f leaves an uncertainty of a twentieth of the period of f
     return DelayResult(d, max(1.0 / np.sqrt(12.0), 0.05 * rate / band), 'free run')
 
 
@@ -207,8 +207,8 @@ def _warn_of_creep(fits: FreeRunFits) -> list[str]:
     ours, theirs = (100.0 * float(np.sqrt(c.error)) for c in (fits.best, more))
     return [
         f'the stage may creep: with creep the model predicts parts of the data from the others to '
-        f'{theirs:.2g} % of stroke instead of {ours:.2g} %, too small a difference to tell '
-        'creep from errors of H; hold a voltage for some seconds behind a step'
+        f'{theirs:.2g} % of stroke instead of {ours:.2g} %. Errors of H could make this small '
+        'difference, too; hold a voltage for some seconds behind a step'
     ]
 
 

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Starts of a free-run fit: a straight line, H alone, G first, H first.
+Search for H, G and the delay by free-run fits from several starts.
 
-The same fit improves each start, and the same comparison judges all of them.  The result therefore
-predicts held-out samples as well as the best start.  Least squares (ARX) gives G at several orders
-and delays, once from the voltage and once from the output of H.  The fit then varies H, G and the
-memory at the start together.
+The starts are H alone, G from the voltage with a straight line for H, and G from the output of H.
+Least squares (ARX) gives each G at several orders and delays.  The free-run fit then varies H, G
+and the memory at the start together.  One comparison on held-out samples judges all fits, so the
+result predicts these samples as well as the best start.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Allowed:
 
     @property
     def is_free(self) -> bool:
-        """Whether neither delay nor order is fixed."""
+        """Whether the search may choose both the delay and the order."""
         return self.delay is None and self.order is None
 
     @property
@@ -73,9 +73,9 @@ def linear_starts(
     inputs: Sequence[Array], stretches: Sequence[Stretch], allowed: Allowed, of: Sequence[int]
 ) -> dict[tuple[int, int], tuple[int, Dynamics]]:
     """
-    Find for each order na the delay and the G of least squares with the smallest free-run error.
+    Find the delay and the G of least squares with the smallest free-run error, for each order.
 
-    `inputs` are those of G on each stretch, normalised.
+    `inputs` holds the input of G on each stretch, normalised.
     """
     orders = allowed.orders(of)
     rate = stretches[0].rate
@@ -107,7 +107,7 @@ def _by_least_squares(
         for a, b in true_runs(s.use)
     ]
     fits = []
-    # a long order leaves short parts out; use the largest order for which a part is long enough
+    # a long order needs long parts; use the largest order for which a part is long enough
     for most in sorted({na for na, _ in orders}, reverse=True):
         lags = max(nb for na, nb in orders if na <= most) + max(delays) + 1
         long = [(w, x) for w, x in parts if w.size > 3 * (most + lags)]
@@ -146,9 +146,9 @@ class Search:
     Search for H, G and the delay on a few stretches.
 
     `sets` and `kinds` hold the set and the kind of motion of each block, for the comparison.
-    `guesses`, shape (records, PARTS), are those of the memory at the start of each record; a row
-    of zeros is a known start.  `law` is that of plays alone.  `tick` is called between the steps;
-    it may raise to stop the work.
+    `guesses`, shape (records, PARTS), holds the guessed memory at the start of each record; a row
+    of zeros is a known start.  `law` is the law of plays.  The search calls `tick` between its
+    steps; `tick` may raise to stop the work.
     """
 
     stretches: Sequence[Stretch]
@@ -163,8 +163,8 @@ class Search:
         """
         Find the best candidate, and list all candidates.
 
-        All starts count as unknown if a free memory at the starts at rest lowers the error by as
-        much as an effect must.
+        A start at rest has a known memory.  The search also tries to fit this memory.  All starts
+        count as unknown if the fitted memory lowers the error by as much as an effect must.
         """
         alone = self._hysteresis_alone()
         if self._starts_otherwise(self._candidate('hysteresis', alone)):
@@ -180,6 +180,7 @@ class Search:
         return replace(self, guesses=np.where(self.guesses > 0.0, self.guesses, UNKNOWN))
 
     def _starts_otherwise(self, one: Candidate) -> bool:
+        """Tell whether a fitted memory at the starts at rest lowers the error enough."""
         if self.guesses.any(axis=1).all():
             return False
         stage = replace(one.fit.stage, guesses=self._unknown_starts.guesses)
@@ -188,9 +189,10 @@ class Search:
 
     def at_rest(self, candidates: Sequence[Candidate]) -> Candidate:
         """
-        Choose the best candidate with starts at rest, if free starts do not lower its error.
+        Choose the best candidate; its starts are at rest unless fitted memories lower its error.
 
-        The starts were freed with an H of plays.  A wider law may need no memory from before.
+        The memories were first fitted with an H of plays.  With a wider law of H, the same starts
+        may be at rest.
         """
         best = best_of(candidates)
         if np.array_equal(best.fit.stage.guesses, self.guesses):
@@ -254,7 +256,7 @@ class Search:
         return replace(crept, dynamics=faster.normalised())
 
     def _later(self, best: Candidate) -> list[Candidate]:
-        """Drop the first coefficient of B for a sample of delay more, while the error falls."""
+        """Replace the first coefficient of B by a sample of delay, while the error falls."""
         accepted: list[Candidate] = []
         one = best
         while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:

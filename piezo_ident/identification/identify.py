@@ -71,7 +71,7 @@ def identify(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
-    """Learn a stage of one axis, without the promise; see `piezo_ident.identify`."""
+    """Identify a stage of one axis; `piezo_ident.identify` adds the promise to the result."""
     return identify_and_judge(records, settings, validation, progress, steps)[0]
 
 
@@ -82,7 +82,7 @@ def identify_and_judge(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> tuple[Identification, Judged]:
-    """Learn a stage of one axis, and keep what promise, band and deviations follow from."""
+    """Identify a stage of one axis; also return the base of promise, band and deviations."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
     expect(settings, Settings, 'identify, settings', 'give several records as a list')
@@ -162,10 +162,10 @@ def first_steps(
     progress: Progress,
 ) -> Steps:
     """
-    Take the step `which`, 'delay' or 'dynamics', and the first step before it if it is missing.
+    Take the step `which`, 'delay' or 'dynamics'; the dynamics take a missing delay first.
 
     The delay needs segments ``step`` or ``noise``.  The dynamics need ``noise`` and ``triangle``,
-    since the hysteresis has to be undone.  Raises IdentificationError without them.
+    because the hysteresis has to be undone.  Raises IdentificationError without these segments.
     """
     data, steps = prepare(records), (steps or Steps()).beside(settings.delay)
     with singular_is_ours():

@@ -33,8 +33,8 @@ REST = 0.01
 MOVES = 0.02
 #: largest change of the voltage within one averaged row, as a share of its range
 ROW_SPAN = 2e-3
-#: most lost readings in a row that `Excerpt.span` bridges, as the voltage may turn there (taste;
-#: held-out blocks hold no turn, and are longer)
+#: most lost readings in a row that `Excerpt.span` bridges (taste).  The voltage may turn at lost
+#: readings, but not in a held-out block, and held-out blocks are longer
 LOST = 50
 #: smallest number of averages that tells a correlation (taste)
 AVERAGES = 20
@@ -48,8 +48,8 @@ class Excerpt:
     Normalised input and displacement of a fit, shape (n,), and a mask of the samples that count.
 
     Plays and dynamics need the whole input.  `memory` gives the play outputs before the first
-    sample as a function of the thresholds.  By default they are those of a stage that last came
-    down to the lowest voltage.
+    sample as a function of the thresholds.  By default, the voltage last came down to its lowest
+    value.
     """
 
     u: Array
@@ -106,7 +106,7 @@ class Run(Excerpt):
     """
     Normalised piece of a record; the samples that count were measured, away from a bridged gap.
 
-    `known` marks those behind the place where an unknown memory at the start was forgotten.
+    `known` marks the samples that also come after an unknown memory at the start was forgotten.
     """
 
     record: str
@@ -138,7 +138,7 @@ class Run(Excerpt):
         return [(start + a, start + b) for a, b in true_runs(whole)]
 
     def held_out(self) -> Mask:
-        """Mark every fifth block of a triangle without a turning point, and the end of noise."""
+        """Mark every fifth triangle block without a turn, and the end of noise and steps."""
         held = np.zeros(self.piece.n, dtype=bool)
         for s in self.piece.segments:
             if s.kind in ('noise', 'step'):
@@ -157,8 +157,8 @@ class Prepared:
     """
     Records ready for the steps.
 
-    The records lack their faulty readings.  Their pieces have one sampling rate [Hz], and the runs
-    are the pieces, normalised.  The warnings name faults of the data, and data that are left out.
+    Faulty readings are removed from the records.  The pieces have one sampling rate [Hz], and the
+    runs are the normalised pieces.  The warnings name faults of the data, and data left out.
     """
 
     rate: float
@@ -180,7 +180,7 @@ class Prepared:
 
 
 def prepare(records: Sequence[Record]) -> Prepared:
-    """Prepare records, and refuse those whose displacement does not answer the voltage."""
+    """Prepare records; refuse records whose displacement does not answer the voltage."""
     if not records:
         raise IdentificationError('no record was given')
     for record in records:
@@ -201,8 +201,8 @@ def prepare(records: Sequence[Record]) -> Prepared:
             lost = sum(p.filled / p.piece.sample_rate for p in parts)
             faults.append(
                 f'{record.name}: gaps were bridged by straight lines, {gaps} with {filled} '
-                f'samples or {lost:.2g} s; neither they nor the moment after each were fitted or '
-                'judged'
+                f'samples or {lost:.2g} s; the fit and its errors leave out each gap and the '
+                'moment after it'
             )
     # if the columns are swapped, v has the noise of a sensor, which quiet voltage would hide
     faults += [text for record in measured for text in suspicions(record)]
@@ -234,7 +234,7 @@ def same_rate(one: float, other: float) -> bool:
 
 
 def common_rate(records: Sequence[Record]) -> tuple[float, list[str]]:
-    """Choose the sampling rate that carries the most voltage travel, and list what is left out."""
+    """Choose the sampling rate with the most voltage travel, and list the data of other rates."""
     travel: dict[float, float] = {}
     time: dict[float, float] = {}
     for record in records:
@@ -323,7 +323,7 @@ def excerpts_of(runs: Sequence[Run], *kinds: str, held: bool = False) -> list[Ex
     excerpts = []
     for run in runs:
         out, use = run.held_out(), run.mask(*kinds) & run.known
-        # the same runs either way, so that each run keeps its offset
+        # fitted and held-out excerpts come from the same runs, so that each run keeps its offset
         if np.any(use & ~out):
             excerpts.append(run.excerpt(use & (out if held else ~out)))
     return excerpts

@@ -31,9 +31,9 @@ ROUNDING = 1e-9
 PARTS, ROWS, PLAYS = 8, 500, 8
 #: rates of the decays of a slow drift, in 1 / duration
 DECAYS = 2.0 ** np.arange(-1.0, 7.0, 0.5)
-#: largest bend of a position under control, as a share of its travel (a measured stage stays
-#: within 2.4e-4), and smallest bend of its drive relative to it (a measured drive bends 18 times
-#: as much)
+#: A position is under control if its bend, as a share of its travel, is below `STRAIGHT`, and its
+#: drive bends more than `BENT` times as much.  A measured position under control bent by less than
+#: 2.4e-4, and a measured drive 18 times as much
 STRAIGHT, BENT = 5e-4, 15.0
 
 
@@ -67,8 +67,8 @@ def refuse_undriven(records: Sequence[Record]) -> None:
     low, high = (f([getattr(p.v, f.__name__)() for p in pieces]) for f in (min, max))
     raise IdentificationError(
         f'{", ".join(record.name for record in records)}: the displacement does not answer the '
-        f'voltage, which stays within {low:.4g} .. {high:.4g} V: held-out parts are predicted to '
-        f'{driven:.3g} % of stroke with the voltage, and to {resting:.3g} % without it; record '
+        f'voltage, which stays within {low:.4g} .. {high:.4g} V. A model predicts held-out parts '
+        f'to {driven:.3g} % of stroke with the voltage, and to {resting:.3g} % without it; record '
         'the stage while it is driven, and see that the sensor measures it'
     )
 
@@ -152,9 +152,9 @@ def refuse_closed_loop(record: Record) -> None:
     """
     Refuse a record under position control, where the voltage answers the position.
 
-    Two signs are known.  The drive moves while the position is held, or the position follows a
-    straight line more closely than the drive.  Neither happens under voltage control: the stage
-    creeps, and its hysteresis bends the displacement, not the voltage.
+    Position control has two signs.  The drive moves while the position is held, or the position
+    follows a straight line more closely than the drive.  Voltage control shows the opposite: the
+    stage creeps, and its hysteresis bends the displacement, not the voltage.
     """
     span, stroke = float(np.ptp(record.voltage_range)), record.stroke
     if span == 0.0 or stroke == 0.0:
@@ -181,7 +181,7 @@ def _refuse_hold(name: str, piece: Piece, span: float, stroke: float) -> None:
         raise IdentificationError(
             f'{name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by {moved:.1%} of '
             f'its range while the position moves by {followed:.2%} of its stroke: {cause}, so the '
-            'position is no response to the voltage; record in open loop'
+            'position does not answer the voltage; record in open loop'
         )
 
 
@@ -200,8 +200,8 @@ def _refuse_ramp(name: str, piece: Piece, span: float, stroke: float) -> None:
                 raise IdentificationError(
                     f'{name}: from {piece.t[start]:.3g} to {piece.t[stop - 1]:.3g} s the '
                     f'position follows a straight line to {bend_y:.3%} of its travel and the '
-                    f'voltage only to {bend_v:.2%}: a position controller was on, so the position '
-                    'is no response to the voltage; record in open loop'
+                    f'voltage only to {bend_v:.2%}. A position controller was on, so the position '
+                    'does not answer the voltage; record in open loop'
                 )
 
 

@@ -36,7 +36,7 @@ class Steps:
     dynamics: tuple[DynamicsResult, Dynamics] | None = None
 
     def beside(self, delay: int | None) -> Steps:
-        """Keep these results, unless another delay was given for them or is given now."""
+        """Keep these results; drop them if the user gives another delay, or no longer gives it."""
         before = self.delay
         was_given = before is not None and before.source == 'given'
         is_same = before is not None and before.samples == delay
@@ -73,7 +73,7 @@ class Headline:
     """
     Error of a model, and of its hysteresis alone, over all `n` driven samples of one kind of data.
 
-    `data` and the percentages are those of `ErrorRow`; these are NaN without samples.
+    `data` and the percentages are as in `ErrorRow`; the percentages are NaN without samples.
     """
 
     data: str
@@ -93,9 +93,9 @@ class FitOutcome:
     masks : sequence of (fitted, selection)
         For each run, the fitted samples and the samples that only chose between models.
     offsets : mapping
-        Distance of the zero of displacement of a run from the zero of the model [m].
+        Zero of displacement of each run, measured from the zero of the model [m].
     judged : (StageModel, Memories) or None
-        Judged model and memories, if the final model was fitted to all data.
+        Model and memories that the held-out samples judged; None if they judged the final model.
     fit : Fit or None
         The fit of all parameters together.
     """
@@ -140,8 +140,8 @@ class Identification(Showable):
     records : tuple of Record
         Fitted records, then the records for validation.
     memories : mapping of (str, float) to ndarray or Start
-        Fitted play outputs at the start of a piece, and creep that goes on from there; keys are
-        record name and start time.
+        Fitted play outputs at the start of a piece, and the creep left from earlier motion; keys
+        are record name and start time.
 
     Examples
     --------

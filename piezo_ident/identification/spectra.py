@@ -95,8 +95,8 @@ def broadband_response(
     Estimate the response from the output of a hysteresis to the displacement, from any motion.
 
     The parts are unbroken stretches of any length: voltage, output of the hysteresis,
-    displacement.  The result holds the frequencies that both voltage and displacement show; None
-    if these are too few, as with a single sine.
+    displacement.  The result holds the frequencies that both voltage and displacement show.  The
+    result is None if these frequencies are too few, as with a single sine.
     """
     longest = max((v.size for v, _, _ in parts), default=0)
     segment = min(_power_of_two(longest // 16), SEGMENT)
@@ -105,7 +105,7 @@ def broadband_response(
         return None
     driven = _response([(v, y) for v, _, y in parts], segment, sample_rate)
     response = _response([(w, y) for _, w, y in parts], segment, sample_rate)
-    # a hysteresis adds frequencies without voltage there, which would only tell of its own model
+    # H has output at frequencies without voltage, where the response would only describe H itself
     told = np.maximum(driven.std, response.std) <= TRUSTED
     # a Hann window blurs the lowest two bins, next to the trend that was removed
     told[:3] = False

@@ -5,9 +5,9 @@
 Fit the unknown memory of labelled runs that do not start at the lowest voltage.
 
 Until the voltage has moved by the width of a play, the play may stand still at an unknown place.
-The free-run fit finds the places together with the plays, so no part of a run has to be dropped.
-It runs over the extremes of the slow motion, which alone move the plays.  From a wrong guess it
-ends at another memory, so the fit begins at several guesses.
+A free-run fit finds the places together with the plays, so the whole run can be fitted.  The fit
+uses only the extremes of the slow motion, because they alone move the plays.  The fit begins at
+several guesses, because a wrong guess leads to a wrong memory.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ FINER = 2
 ENDS = (0.9, 0.1)
 #: iterations from every guess, from the best guesses, and number of the best
 FEW, MANY, BEST = 3, 15, 1
-#: share by which another guess must err less than the plain guess: a record of steps alone cannot
-#: tell the memory
+#: share by which another guess must err less than the plain guess to be chosen: a record of steps
+#: alone tells little about the memory
 CLEARLY = 0.02
 
 
 def _guesses() -> Array:
-    """List shares between the branches of a stage, then behind a last rise and a last fall."""
+    """List guesses: between the branches of a stage, after a last rise, and after a last fall."""
     between = [np.full(PARTS, share) for share in (0.5, 0.25, 0.75)]
     turned = [np.where(np.arange(PARTS) < k, *ENDS) for k in range(PARTS + 1)]
     back = [1.0 - shares for shares in turned[1:-1]]

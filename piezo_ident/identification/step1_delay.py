@@ -6,8 +6,8 @@ Step 1: find the pure delay from steps, and check it by a scan of the ARX loss.
 
 The step responses are divided by the signed height of their steps and averaged.  The delay is the
 first sample at which the average leaves the noise.  The scan fits ARX models with every delay to
-the noise record.  Its delay is the largest that does not raise the loss.  A free run over the
-noise decides between both.
+the steps or the noise.  Its delay is the largest delay before the loss rises.  If the delays of
+steps and scan differ, a free run over the noise decides.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ CHECK_ORDERS = (4, 8, 12)
 CHECK_DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
 #: errors within this share of the smallest error count as equal to it
 SLACK = 0.05
-#: largest error of the best free run, as a share of the motion, at which it may decide the delay
-#: that neither steps nor scan tell
+#: largest error of the best free run, as a share of the motion, at which the free run may decide
+#: the delay if steps and scan both fail
 FOLLOWS = 0.5
 
 Signals = tuple[Array, Array]
@@ -56,7 +56,7 @@ class StepDelay:
     Attributes
     ----------
     samples : int or None
-        Delay d; None if no response rose above the noise.
+        Delay d; None if all responses stay within the noise.
     std : float
         Standard deviation over repeats [samples], by leaving out each repeat once (jackknife).
         The resolution of the sampling clock, 1/sqrt(12), is its smallest value.
@@ -92,7 +92,9 @@ class DelayResult:
     source : {'steps', 'scan', 'free run', 'given', 'none'}
     step : StepDelay or None
     loss : ndarray or None
-        One-step ARX loss for d = 0, 1, ...; `scan` is the delay that it tells.
+        One-step ARX loss for d = 0, 1, ...
+    scan : int or None
+        Delay from this loss [samples].
     """
 
     samples: int
@@ -198,14 +200,14 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
     responses, heights = step_responses(pieces, before, after)
     lag = np.arange(-before, after)
     n = heights.size
-    # two samples and a line through them leave no residual, hence no noise
+    # a line fits two samples exactly, so their noise would be zero
     if n == 0 or before < 3:
         empty = np.zeros(before + after)
         return StepDelay(None, float('inf'), 0, float('nan'), float('nan'), lag, empty)
     # the noise of a response in m/V falls with the height of its step, so the weight is its square
     weight = heights**2 / np.sum(heights**2)
     mean = _mean(responses, weight)
-    # rounding that remains after a line is taken out of a constant displacement
+    # a constant displacement minus its line leaves rounding
     largest = max(float(np.abs(piece.y).max()) for piece in pieces)
     rounding = 1e-12 * largest / float(heights.max())
     samples, noise, threshold = _first_rise(mean, before, rounding)
@@ -222,7 +224,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
 
 
 def no_step(step: StepDelay | None) -> str:
-    """Say why no step tells the delay: no step exists, or no step rises above the noise."""
+    """Say why the steps do not tell the delay: they are absent, or stay within the noise."""
     if step is None or not step.repeats:
         return 'there are no steps out of a rest'
     return 'no step rises above the sensor noise'
@@ -234,7 +236,7 @@ def delay_from_loss(loss: Array) -> int | None:
 
     A model with too small a delay contains the true model if it has enough numerator
     coefficients.  The loss for d = 0, 1, ... therefore stays low up to the true delay and rises
-    behind it.  None if it has not risen at the largest delay: the scan is then undecided.
+    behind it.  If the loss has not risen at the largest delay, the result is None.
 
     Examples
     --------
@@ -247,15 +249,20 @@ def delay_from_loss(loss: Array) -> int | None:
 
 def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayResult:
     """
-    Choose the delay of steps or of the scan that a free run over noise supports, else another.
+    Check the delays of steps and scan by free runs over noise; replace them if both fail.
 
     Steps and scan give too large a delay if the displacement starts slowly or the noise is not
-    white.  G can make up for a delay that is too small, but not for one that is too large.
-    A delay holds if its free run errs no more than the best.  The smaller of two delays that hold
-    is chosen.  If neither holds, half of the largest delay that holds is chosen.  A result without
-    source stays unchanged if the largest delay holds, and either a delay of 0 does not or no
-    model follows the noise.  `fitted` is input and output of noise, `held` the noise right behind
-    it that judges.
+    white.  G can make up for too small a delay, but not for too large a delay.  A delay holds if
+    the error of its free run is within `SLACK` of the smallest error.  The rule has three cases:
+
+    - The delay of steps or scan holds: choose it, and the smaller delay if both hold.
+    - The delays of steps and scan fail: choose half of the largest delay that holds.
+    - Steps and scan tell no delay (source 'none'): keep the result if the largest delay holds and
+      the delay 0 fails, because the true delay may be larger.  Also keep it if the largest delay
+      holds but the best free run errs by more than `FOLLOWS` of the motion.  Otherwise choose half
+      of the largest delay that holds.
+
+    `fitted` holds input and output of noise.  The noise right behind it, `held`, gives the errors.
     """
     # a result without source holds only the largest delay of the scan
     told = result.samples if result.source != 'none' else None
@@ -274,7 +281,7 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
     least = min(errors)
     hold = [d for d, left in zip(tried, errors, strict=True) if left <= (1.0 + SLACK) * least]
     if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
-        # the delay may be larger, or no model follows the noise
+        # the true delay may be larger, or the models do not follow the noise
         return result
     samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
     if samples == told:
@@ -288,7 +295,7 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
     """
-    Find the delay from the steps, or without steps from a scan of the ARX loss over the noise.
+    Find the delay from the steps; without steps, find it by a scan of the ARX loss over the noise.
 
     A free run over the noise decides if steps and scan differ, or if the scan fails.  Raises
     IdentificationError if no method tells the delay.
@@ -298,8 +305,8 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
         return DelayResult(settings.delay, float('inf'), 'given')
     pieces = [run.piece.cut(s.start, s.stop) for run in runs for s in run.piece.find('step')]
     step = delay_from_steps(pieces) if pieces else None
-    # steps have power at all frequencies; noise up to f leaves an uncertainty of half a period of
-    # f
+    # scan the steps first: they have power at all frequencies, while noise up to f leaves an
+    # uncertainty of half a period of f
     loss = _scan(runs, 'step') if pieces else None
     if loss is None:
         loss = _scan(runs, 'noise')

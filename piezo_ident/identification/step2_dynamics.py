@@ -4,9 +4,9 @@
 """
 Step 2: find G from noise, for every order, free of hysteresis.
 
-Under small noise H is not a constant slope: the noise drags its plays along, and a linear fit
+Under small noise the slope of H is not constant: the noise drags its plays along, and a linear fit
 takes this for slow dynamics.  G is therefore found twice.  After a first G, a temporary H with
-fine thresholds is fitted to the triangle.  Its output w = H[v] replaces the voltage of the noise
+fine thresholds is fitted to the triangle.  The output w = H[v] replaces the voltage of the noise
 segment, and G is found again from w to y.
 """
 
@@ -51,9 +51,9 @@ from scipy import signal
 SLOW_POLE = 40.0
 #: same limit at low sampling rates, as a share of the rate
 SLOW_POLE_SHARE = 0.01
-#: a pole and a zero whose frequencies differ by less than the factor `PAIR` may come from errors
-#: of H on small motion, if they lie below the share `BELOW_MODES` of the lowest mode that rings; a
-#: mode rings if its damping is below `RINGS`
+#: The frequencies of a pole and a zero that form a pair differ by less than the factor `PAIR`.
+#: They lie below the share `BELOW_MODES` of the lowest mode that rings.  A mode rings if its
+#: damping is below `RINGS`.  A pair may come from errors of H on small motion
 PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 #: orders within this share of the best held-out error count as equal; the smallest is tried first
 SLACK = 0.05
@@ -65,8 +65,8 @@ GAIN = 0.005
 WARM_UP = 2000
 #: number of candidate orders that are refined and judged again
 CANDIDATES = 5
-#: most iterations that refine a candidate: with a coarse converter at a high rate, least squares
-#: and instrumental variables start far from modes that ring for long
+#: most iterations that refine a candidate.  Many are needed with a coarse converter at a high
+#: rate: least squares and instrumental variables then start far from modes that ring for long
 REFINING = 40
 #: motion slower than this is creep, not dynamics; it is filtered out before G is refined [Hz]
 SLOWEST = 5.0
@@ -94,8 +94,8 @@ class DynamicsResult:
         Measured response, normalised: from voltage to displacement on a noise segment, else from
         the output of H to displacement on any broadband motion.
     bias, slope_measured, slope_model : float
-        Mean voltage of the measured noise, and the small-signal gain of the measured displacement
-        and of H there, normalised.
+        Mean voltage of the noise segment, and the small-signal gain in this segment: of the
+        measured displacement, and of H.  All are normalised.
     band : float
         Highest frequency with power in the input [Hz].
     """
@@ -336,7 +336,7 @@ def beside_law(
     """
     Refine G with an H of another law than the law with which G was found.
 
-    None if the refined G does not lower the held-out error by `REFINED`.
+    The result is None unless the refined G lowers the held-out error by the share `REFINED`.
     """
     stretches, held = _stretches(runs, H, delay)
     fit = output_error(stretches, G, maxiter=8)
@@ -356,7 +356,7 @@ def _stretches(
         out = run.held_out()
         use = run.mask('step', 'settle', 'noise') & run.use
         if use.any():
-            # samples before the first used sample only have to let the transient die away
+            # the samples before the first used sample let the transient die away
             first, last = np.flatnonzero(use)[[0, -1]]
             part = slice(max(0, int(first) - WARM_UP), int(last) + 1)
             w, y = delay.apply(run.through(H))[part], run.x[part]

@@ -41,13 +41,13 @@ GAIN = 0.01
 SMALL = 4
 #: number of operators of a wider law, and number of parts of the record that are predicted in turn
 FINE, PARTS = 40, 8
-#: share by which a wider law must lower the error of the parts.  On loops of the kinds of Bouc and
-#: Wen and of Duhem, wrong laws lowered the error by up to 17 %; on Preisach loops the right law
-#: lowered it by 60 to 95 %
+#: share by which a wider law must lower the error of the parts.  Wrong laws lowered the error by
+#: up to 17 % (on loops of Bouc-Wen and Duhem models).  The right law lowered it by 60 to 95 % (on
+#: Preisach loops)
 WORTH = 0.25
-#: largest error of a wider law on small motion, relative to the error of plays.  A law with lags
-#: along the path must instead lower the error by `WORTH` there, too (its error was 6 to 27 % on
-#: its own kinds of loops, and 84 % under creep)
+#: largest error of a wider law on small motion, relative to the error of plays.  For a law with
+#: lags along the path, the limit is 1 - `WORTH` instead.  The error of this law was 6 to 27 % on
+#: its own kinds of loops, and 84 % under creep
 NO_WORSE = 1.1
 
 
@@ -168,8 +168,8 @@ class Choice:
     """
     Choice of a law for H; None if the plain sum of plays stays.
 
-    `errors` holds for each law that was tried the geometric mean of the rms errors on parts
-    predicted from all others, normalised.
+    Each part of the data is predicted from all other parts.  `errors` holds, for each tried law,
+    the geometric mean of the rms errors of the parts, normalised.
     """
 
     law: HysteresisLaw | None
@@ -186,8 +186,9 @@ def choose_law(
     """
     Choose the law of H by parts of the data that are predicted from all others.
 
-    `others` is small motion.  A wider law must not err more there than plays, and a law with lags
-    must err less: under a triangle of one speed, creep looks like a lag along the path.
+    `others` is small motion.  On small motion a wider law must err about as little as plays.  A
+    law with lags must err clearly less than plays, because under a triangle of one speed creep
+    looks like a lag along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
     low = min(e.span[0] for e in excerpts)

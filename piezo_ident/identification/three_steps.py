@@ -55,7 +55,7 @@ def model_of(
 
 
 def within(model: StageModel, low: float, high: float) -> StageModel:
-    """Set the identified range of a model, from two normalised voltages."""
+    """Set the identified range of a model to two normalised voltages."""
     span = (model.scaling.v(low), model.scaling.v(high))
     return replace(model, scaling=replace(model.scaling, range=span))
 
@@ -147,11 +147,11 @@ class _LabelledFitter:
         candidates = [best]
         for size in (settings.max_order, *sizes):
             of_size = replace(settings, max_order=size)
-            # no model of so low an order need be stable
+            # all models of such a low order may be unstable
             with suppress(IdentificationError):
                 second = second_step(started, self.delay, of_size, self.progress, lean=True)
                 candidates.append(self.fitted(*second, lean=True))
-        # H may replace the pair, and large orders fit the error of H on the noise
+        # a small order is better: H may replace the pair, and a large order fits errors of H
         limit = (1.0 + AS_WELL) ** 2 * min(one.left for one in candidates)
         return next((one for one in reversed(candidates) if one.left < limit), best)
 
@@ -159,9 +159,9 @@ class _LabelledFitter:
         self, best: _Fitted, delay_result: DelayResult
     ) -> tuple[_Fitted, DelayResult, dict[str, str]]:
         """
-        Drop G and the delay if the model errs less without them; the reasons by their names.
+        Drop G and the delay if the model errs less without them; also return the reasons.
 
-        Both are judged beside fine plays: errors of a few plays say nothing about G.
+        Both models are judged with fine plays, because errors of few plays say nothing about G.
         """
         is_given = delay_result.source == 'given'
         delay, fine = self.delay if is_given else Delay(0), best.model
@@ -173,7 +173,7 @@ class _LabelledFitter:
             return best, delay_result, {}
         reason = (
             f'with {"it" if is_given else "both"} the model errs {np.sqrt(left / of_static):.4g} '
-            'times as much on the data that choose as without; record noise of larger amplitude'
+            'times as much as without on the selection data; record noise of larger amplitude'
         )
         missing = dict.fromkeys(('dynamics',) if is_given else ('delay', 'dynamics'), reason)
         G = Dynamics.unit()

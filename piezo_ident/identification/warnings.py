@@ -72,7 +72,7 @@ def _of_axes(pieces: Sequence[Piece]) -> list[str]:
     if not moved:
         return []
     return [
-        f'{", ".join(moved)} moved, too: what they do to this axis counts as its error and noise; '
+        f'{", ".join(moved)} moved, too: their effect on this axis counts as its error and noise; '
         'record the displacements of these axes, too, and identify all of them (docs/two_axes.md)'
     ]
 
@@ -138,8 +138,7 @@ def _of_fit(result: Identification) -> list[str]:
 
 def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     """Warn if the excitation ends before G acts."""
-    # no warning if the band ends near half the sampling rate, where no frequencies remain, or if G
-    # is static, which has its own message
+    # a band up to nearly half the sampling rate is wide enough; a static G has its own message
     if not dynamics.known_to < 0.2 * model.sample_rate or model.dynamics.is_static:
         return []
     G = model.dynamics.response([dynamics.known_to], model.sample_rate)[0]
@@ -148,8 +147,8 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
         return []
     return [
         f'the voltage drives the stage up to {dynamics.known_to:.3g} Hz, where G is within '
-        f'{100 * change:.2g} % of its static gain, so G is unknown at higher frequencies; record '
-        'noise up to there'
+        f'{100 * change:.2g} % of its static gain. G is unknown at higher frequencies; record '
+        'noise of higher frequencies'
     ]
 
 
@@ -180,8 +179,8 @@ def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
         times = sum(float(np.abs(np.diff(piece.v)).sum()) for piece in pieces) / span
         once = f'the voltage crosses its range {times:.2g} times; drive it more often'
         warnings.append(
-            f'the held-out error is {held / max(fitted, 1e-9):.1f} times the fitted one: this '
-            'record does not pin the model down, '
+            f'the held-out error is {held / max(fitted, 1e-9):.1f} times the fitted error: this '
+            'record does not determine the model, '
             + (f'as {once}' if times < CROSSINGS else 'or the stage changes in it')
         )
     return warnings
@@ -214,7 +213,7 @@ def _jumped_over(u: Array) -> float:
 
 def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[str]:
     """
-    Warn if the displacement depends on the voltage as no H of this package can.
+    Warn of a measured loop whose shape no H of this package has.
 
     The branches of H rise.  Less than half of the variance of its loop is therefore even, that is,
     the same for a rise of the voltage from the middle as for a fall.  Loops of plays are widest in
@@ -267,7 +266,7 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
 
 
 def warn_of_thresholds(held: Sequence[Excerpt], count: int | None) -> list[str]:
-    """Warn if no block of the triangle is held out, so that nothing chooses the thresholds."""
+    """Warn if the triangle has no held-out block, which would choose the thresholds."""
     if count is not None or any(e.use.any() for e in held):
         return []
     return [
@@ -295,16 +294,16 @@ def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling)
         return []
     one, other = (f'{scaling.v(low):.3g} .. {scaling.v(high):.3g} V' for low, high in spans)
     return [
-        f'the fitted part covers {one}, the held-out part {other}: its error is partly '
-        'one of extrapolation'
+        f'the fitted part covers {one}, the held-out part {other}: part of the held-out error '
+        'comes from extrapolation'
     ]
 
 
 def warn_of_zeros(offsets: Mapping[tuple[str, float], float], scaling: Scaling) -> list[str]:
     """Warn if the displacement of a run has another zero than the model."""
     return [
-        f'{record}: its zero of displacement lies {1e6 * offset:.3g} um from that of the model; '
-        'its errors are told without it'
+        f'{record}: its zero of displacement lies {1e6 * offset:.3g} um from the zero of the '
+        'model; its errors do not include this shift'
         for (record, _), offset in offsets.items()
         if abs(offset) > ZERO_MOVED * abs(scaling.Y)
     ]

@@ -137,7 +137,7 @@ def test_a_record_of_many_sweeps_is_not_told_to_sweep_more(linear):
     poor = replace(result, errors=tuple(rows))
     [piece] = record
     for pieces, is_said in (([piece], False), ([piece.cut(0, 260)], True)):
-        [said] = [x for x in warnings_of(poor, [record], pieces) if 'times the fitted one' in x]
+        [said] = [x for x in warnings_of(poor, [record], pieces) if 'times the fitted error' in x]
         assert ('drive it more often' in said) == is_said
 
 
