@@ -70,7 +70,7 @@ def candidate(
         return Candidate(name, fit, blocks, blocks, effects)
     out = kinds >= 0
     left = fit.held_out(kinds)
-    # blocks without a kind were fitted, so their errors do not count
+    # only blocks of a kind were held out, so only their errors count
     return Candidate(name, fit, blocks, float(left[out].sum() / rows[out].sum()), effects)
 
 
@@ -89,7 +89,7 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
-    """Find the candidate of smallest error with more effects than `chosen`, if it errs less."""
+    """Find the best candidate with more effects than `chosen`; None unless it errs less."""
     more = [c for c in candidates if c.effects > chosen.effects]
     best = min(more, key=lambda c: c.error, default=None)
     return best if best is not None and ALIKE * best.error < chosen.error else None

@@ -13,7 +13,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
-    # a prediction needs no fit, and no scipy.signal
+    # a prediction works without a fit, hence without scipy.signal
     from piezo_ident.fitting.free_run import Fit
 
 
@@ -49,9 +49,9 @@ class JudgedRun:
 @dataclass(frozen=True, eq=False)
 class Judged:
     """
-    Base of the promise, the band and the deviations of an identification.
+    Runs from which the promise, the band and the deviations of an identification follow.
 
-    `fit` is the fit of all parameters together; None if the model was identified in steps.
+    `fit` is the fit of all parameters together, or None for a model that was identified in steps.
     """
 
     runs: tuple[JudgedRun, ...]
@@ -59,7 +59,7 @@ class Judged:
 
     @property
     def tests_other_motion(self) -> bool:
-        """Whether a segment of motion was in no fit; a fit of all parameters holds out parts."""
+        """Whether some motion was not fitted: a segment, or the parts that `fit` held out."""
         return self.fit is not None or any(
             s.kind not in ('idle', 'ramp') and run.held[s.start : s.stop].all()
             for run in self.runs
@@ -73,9 +73,9 @@ class Promise:
     Expected free-run errors on another record of the same stage, % of stroke.
 
     `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
-    within the swings and speeds of these records.  `other` is None, which means not known, if each
-    segment of motion was in a fit.  Hum, drift and other effects of time count in full: the other
-    record has them, and the model does not.
+    within the swings and speeds of these records.  `other` is None (unknown) if every segment of
+    motion was fitted.  Hum, drift and other effects of time count in full, because another record
+    has them and the model lacks them.
     """
 
     same: float

@@ -6,7 +6,7 @@ Find kinds of motion in a record without labels, from the voltage in each block.
 
 A block is described by the mean, the size and the speed of its voltage.  Similar blocks form a
 kind.  A kind with the smallest or largest mean, size or speed is always fitted, because a model
-that was fitted to the others would extrapolate.
+fitted to the other kinds would extrapolate to it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
     """
     Find the kind of motion of each of `count` blocks; -1 for blocks that are not held out.
 
-    None if fewer than `FEWEST` kinds can be held out.
+    The result is None if fewer than `FEWEST` kinds can be held out.
     """
     described = np.full((count, 3), np.nan)
     for s in stretches:
@@ -56,7 +56,7 @@ def kinds_of(described: Array) -> Integers | None:
     """
     Group blocks by their description; the kinds have shape (blocks,), with -1 for no kind.
 
-    The description has shape (blocks, k), with NaN for a block without description.  None as in
+    The description has shape (blocks, k); an unknown block is NaN.  The result may be None, see
     `motion_kinds`.
     """
     known = np.flatnonzero(np.isfinite(described).all(axis=1))
