@@ -4,9 +4,10 @@
 """
 Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
 
-Topics are found by the quantity of their blocks, so remapped names are no obstacle; namespaces
-tell the stages of a bag apart.  A bag and a live capture of the same blocks become the same
-record.  The bag of a killed recorder is refused, or read as far as it goes if that is asked for.
+Topics are found by the quantity of their blocks, so their names may be remapped.  Namespaces tell
+the stages of a bag apart.  A bag and a live capture of the same blocks become the same
+record.  If the recorder was killed, the bag is refused; with `ReadOptions.recover` its whole
+messages are read.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ def opened_bag(path: str | Path, *, in_file_order: bool = False) -> Iterator[Bag
     Open a rosbag2 folder, or a single .mcap or .db3 file, as far as it was finished.
 
     The file may be compressed as a whole, or message by message.  `in_file_order` gives the
-    messages as they were written, not by their log times.  DataError for no bag, and for more
-    damage than a killed recorder leaves; the iteration over its messages raises it too.
+    messages as they were written, not by their log times.  Raises DataError if the path is no bag,
+    or has more damage than a killed recorder leaves; so does the iteration over the messages.
     """
     path = Path(path)
     try:
@@ -96,7 +97,7 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
         raise DataError(f'{path}: damaged or unfinished bag (metadata of wrong types); mend it')
 
     def messages(connections: Collection[Connection]) -> Iterator[Stored]:
-        if connections:  # rosbags takes no connection for all connections
+        if connections:  # rosbags takes an empty list for all connections
             with damage_as_data_error(path, *DAMAGED):
                 stored = itertools.starmap(Stored, reader.messages([*connections]))
                 yield from unpacked(stored, path)
@@ -105,12 +106,12 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
 
 
 def _has_index(reader: Reader) -> bool:
-    """Return whether every message of an mcap file is indexed: rosbags skips the others."""
+    """Return whether every message of an mcap file is in the index; rosbags skips the rest."""
     storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
     for storage in storages:
         chunks = getattr(storage, 'chunks', None)
         indexed = sum(sum(chunk.channel_count.values()) for chunk in chunks or ())
-        # without statistics rosbags counts by the index too
+        # without statistics rosbags takes the count from the index, which may be empty
         if chunks is not None and indexed < max(storage.metadata.message_count, len(chunks[:1])):
             return False
     return True
@@ -122,8 +123,8 @@ def read_bag(path: str | Path, options: ReadOptions | None = None, **choices: An
 
     Blocks come in the order of their log times, or of the file if the log clock was set back.  If
     the bag holds ``applied_voltage``, samples that the amplifier's guard altered are cut out, as
-    in a live capture.  DataError for a damaged bag, a wrong layout of blocks, a voltage or
-    displacement on no topic or on several, and for columns that `assemble` refuses.
+    in a live capture.  Raises DataError if the bag is damaged, a block has a wrong layout, the
+    voltage or the displacement is not on exactly one topic, or `assemble` refuses the columns.
     """
     path = Path(path)
     options = replace(options or ReadOptions(), **choices)
@@ -162,8 +163,8 @@ def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Itera
     Open a bag whose messages come in the order of its samples.
 
     The messages come by their log times, or in the order of the file if the log clock was set
-    back.  `look` returns the number of blocks that go back, see `steps_back`, and a value, which
-    is passed on for the order that is taken.
+    back.  `look` reads a bag, and returns the number of blocks that go back (`steps_back`) and a
+    value.  The context yields the bag with the better order, and the value for this order.
     """
     with ExitStack() as stack:
         bag = stack.enter_context(opened_bag(path))
@@ -179,7 +180,7 @@ def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Itera
 
 class LogClock:
     """
-    Log times that rise on every topic: later by each step back of their clock.
+    Log times that rise on every topic: after a step back of the clock, later times are shifted.
 
     >>> clock = LogClock()
     >>> [clock.rising('v', stamp) for stamp in (5, 6, 3, 4)], clock.steps
@@ -202,7 +203,7 @@ class LogClock:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """A fault if the clock was set back."""
+        """One fault if the clock was set back, else empty."""
         where = f'by {max(self.steps, default=0) / 1e9:.3g} s from one block to the next'
         action = 'blocks taken in the order of the file'
         fault = Fault('log_time_step', where, len(self.steps), action)
@@ -210,7 +211,7 @@ class LogClock:
 
 
 def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
-    """Return the number of blocks that begin before the end of the block before."""
+    """Count the blocks that begin before the previous block of their quantity ends."""
     ends: dict[str, float] = {}
     back = 0
     for quantity, samples in blocks:
@@ -221,7 +222,7 @@ def steps_back(blocks: Iterable[tuple[str, Samples]]) -> int:
 
 
 def _sample_rate(path: Path) -> float | None:
-    """Return the sampling rate [Hz] in a bag's custom data, None without a positive one."""
+    """Return the sampling rate [Hz] in the custom data of a bag; None unless it is positive."""
     try:
         info = metadata(path if path.is_dir() else path.parent)
         if path.is_file() and path.name not in info['relative_file_paths']:
@@ -272,7 +273,7 @@ def is_computed(topic: str) -> bool:
 def _choose(
     carried: Mapping[str, str], asked: Mapping[str, str | None], namespace: str | None, path: Path
 ) -> dict[str, str]:
-    """Return the topic of each quantity, the applied voltage among them if it is there."""
+    """Choose the topic of each quantity, and of the applied voltage if the bag has it."""
     chosen = {q: _topic_of(carried, q, topic, namespace, path) for q, topic in asked.items()}
     home = chosen['voltage'].rpartition('/')[0] + '/'
     applied = f'{home}{APPLIED}'
@@ -295,7 +296,7 @@ def _choose(
 def _topic_of(
     carried: Mapping[str, str], quantity: str, asked: str | None, namespace: str | None, path: Path
 ) -> str:
-    """Return the topic that is asked for, or the one measured topic below a namespace."""
+    """Choose the requested topic, or the only measured topic below a namespace."""
     topics = ', '.join(f'{topic} ({carried[topic]})' for topic in sorted(carried))
     if asked is not None:
         topic = f'/{asked.lstrip("/")}'
@@ -311,7 +312,7 @@ def _topic_of(
     if there and not measured:
         raise DataError(
             f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
-            f'measured {quantity}; record that, or name the topic to take'
+            f'measured {quantity}; record a measured {quantity}, or name the topic to take'
         )
     # applied_voltage carries the same quantity under another name
     commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags without an index, read from the beginning of their files, message by message.
+Read bags without an index: from the beginning of each file, message by message.
 
 An unfinished bag lacks metadata.yaml or the end of an mcap file, or the journal of a transaction
 lies beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all committed
-rows of a database.  The bag stays as it is: recovery applies journals to copies, and unpacks
+rows of a database.  Recovery does not change the bag: it applies journals to copies, and unpacks
 compressed files into copies.
 """
 
@@ -66,7 +66,7 @@ class Bag:
 
     `messages` yields the messages of some connections, in the order of their log times if the bag
     has an index, else in the order of the files.  `start` and `end` are the log times of the first
-    and the last message [ns], equal for an empty bag; `faults` the damage of the bag as a whole.
+    and the last message [ns]; they are equal for an empty bag.  `faults` lists the damage.
     """
 
     path: Path
@@ -79,7 +79,7 @@ class Bag:
 
 def storage_of(path: Path) -> str:
     """
-    Return the storage of a bag's file by its name, compressed or not; empty for no bag.
+    Return the storage of a bag file from its name; empty for the name of another file.
 
     >>> [storage_of(Path(x)) for x in ('a.mcap', 'a_0.db3.zstd', 'a.csv')]
     ['.mcap', '.db3', '']
@@ -93,7 +93,7 @@ DAMAGED = 'unfinished bag', "record it again, or try 'ros2 bag reindex' and 'mca
 
 
 def metadata(folder: Path) -> dict[str, Any]:
-    """Return the contents of a folder's ``metadata.yaml``; ConfigError if it is no YAML."""
+    """Return the contents of ``metadata.yaml`` in a folder; ConfigError unless it is YAML."""
     info = load_yaml(folder / 'metadata.yaml').get('rosbag2_bagfile_information')
     return info if isinstance(info, dict) else {}
 
@@ -148,7 +148,7 @@ def _is_cut_off(file: Path) -> bool:
 
 
 def _sidecars(file: Path) -> list[Path]:
-    """Return the journals beside a database that are not empty."""
+    """Return the non-empty journals of a database."""
     beside = [file.with_name(file.name + end) for end in _SIDECARS]
     return [s for s in beside if s.is_file() and s.stat().st_size]
 
@@ -204,8 +204,8 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
         f'in {path.name}, {(end - start) / 1e9:.3f} s after its first message',
         len(lacking),
         f'recovered the {sum(c.msgcount for c in connections)} messages before that; the recorder '
-        f'did not close the bag ({"; ".join(lacking)}), so what came later is lost and how much '
-        'it was is unknown',
+        f'did not close the bag ({"; ".join(lacking)}), so later messages are lost, and their '
+        'number is unknown',
     )
     return Bag(path, connections, messages, start, end, (fault,) if lacking else ())
 
@@ -227,7 +227,7 @@ def unpacked(messages: Iterable[Stored], path: Path) -> Iterator[Stored]:
 
 
 def _unpacked_file(file: Path, stack: ExitStack) -> Path:
-    """Return a file itself, or a copy that is unpacked."""
+    """Unpack a compressed file into a copy, and return the copy; return any other file itself."""
     found = _BAG_FILE.fullmatch(file.name)
     if found is None or found['name'] == file.name:
         return file
@@ -252,7 +252,7 @@ def _work_folder(stack: ExitStack) -> Path:
 
 def _mcap_part(file: Path) -> _Part:
     """Read an mcap file from its beginning by the package `mcap`, as far as chunks are whole."""
-    # no ROS distribution packages it, so it may not be there
+    # the distributions of ROS lack this package, so it may be missing
     kinds = library('mcap.records', file, 'mcap')
     stream_reader = library('mcap.stream_reader', file, 'mcap')
     ended: list[bool] = []
@@ -277,7 +277,7 @@ def _mcap_part(file: Path) -> _Part:
                     elif isinstance(record, kinds.DataEnd):
                         ended.append(True)
                         return
-            # struct, zstd, lz4 and mcap have errors of their own for a file that ends too early
+            # if a file ends too early, struct, zstd, lz4 and mcap raise different errors
             except Exception:  # noqa: BLE001
                 return
 
@@ -295,7 +295,7 @@ def _mcap_part(file: Path) -> _Part:
 def _connection(channel: Any, schema: Any) -> Connection:
     try:
         qos = parse_qos(channel.metadata.get('offered_qos_profiles', ''))
-    # the profiles matter to a replay alone, and it has its own
+    # only a replay needs the profiles, and it has its own
     except Exception:  # noqa: BLE001
         qos = []
     form = _FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE)
@@ -317,7 +317,7 @@ def _sqlite_part(file: Path, stack: ExitStack) -> _Part:
     connections = {c.id: c for c in reader.connections if c.msgcount}
 
     def messages() -> Iterator[Stored]:
-        # rosbags has them by their log times alone
+        # rosbags yields messages by their log times, not in the order of the file
         place = f'{database.resolve().as_uri()}?mode=ro&immutable=1'
         with closing(sqlite3.connect(place, uri=True)) as opened:
             for topic, *stored in opened.execute(
@@ -335,7 +335,7 @@ def _sqlite_part(file: Path, stack: ExitStack) -> _Part:
 
 
 def _applied(file: Path, stack: ExitStack) -> Path:
-    """Return a database with its journal applied: itself when there is none, else a copy."""
+    """Apply the journal to a copy of a database; without a journal return the database itself."""
     parts = [file, *_sidecars(file)]
     if len(parts) == 1:
         return file
@@ -350,8 +350,8 @@ def _applied(file: Path, stack: ExitStack) -> Path:
         shutil.copyfile(part, folder / part.name)
     copy = folder / file.name
     with closing(sqlite3.connect(copy)) as database:
-        # the first look at it takes back what was not committed
+        # the first query rolls back an unfinished transaction
         database.execute('SELECT count(*) FROM sqlite_master').fetchone()
-        # and this brings what is in a write-ahead log into the file
+        # this moves the contents of a write-ahead log into the file
         database.execute('PRAGMA journal_mode=DELETE').fetchone()
     return copy

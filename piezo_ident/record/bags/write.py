@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Bags: a whole record, or messages as they arrive, which are on disk soon after.
+Write bags: a whole record, or messages as they arrive.
 
-rosbags itself keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until
-the bag is closed.  The calls that end a chunk or a transaction early are internals of rosbags:
-`BagWriter` looks for them before the first message, and `setup.py` bounds the version.
+rosbags keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until the bag
+is closed.  `BagWriter` ends chunks and transactions early, so that messages are on disk soon.  The
+calls for this are internals of rosbags: `BagWriter` looks for them before the first message, and
+`setup.py` bounds the version.
 """
 
 from __future__ import annotations
@@ -75,9 +76,9 @@ class BagWriter:
         The folder to make; a taken name gets a number.
     storage : {'mcap', 'sqlite3'}
     custom_data : mapping of str to str, optional
-        For the bag's metadata.
+        Entries in the metadata of the bag.
     max_size : int, optional
-        0 for one bag.
+        Size of a part [bytes on disk]; 0 for a single bag.
 
     Attributes
     ----------
@@ -120,7 +121,7 @@ class BagWriter:
                 self._writer.abort()
             raise DataError(
                 f'{self.path}: this version of rosbags cannot be told to put messages on disk; '
-                'install one that setup.py names'
+                'install a version that setup.py names'
             ) from None
         custom = dict(self._custom_data)
         if self.max_size:
@@ -134,7 +135,7 @@ class BagWriter:
 
     def _opened(self) -> Writer:
         path, begin = self._path, self._number + 1 if self.parts else 0
-        # from the last number on: a week has more parts than tried names
+        # begin at the last number, because a recording of a week has more parts than `NAMES`
         for number in range(begin, begin + NAMES):
             place = path.with_name(f'{path.name}_{number}') if number else path
             try:
@@ -194,9 +195,10 @@ class BagWriter:
 
     def flush(self) -> None:
         """
-        Hand all messages to the system, so that no end of this process loses them.
+        Hand all messages to the system, so that they survive the end of this process.
 
-        A full part is closed and the next one begun.  DataError if a bag cannot be written.
+        `flush` also closes a full part and begins the next part.  DataError if a bag cannot be
+        written.
         """
         with self._disk_errors():
             self._hand_over()
@@ -217,7 +219,7 @@ class BagWriter:
             raise
 
     def abort(self) -> None:
-        """Let go of the file as it is."""
+        """Close the file without index and metadata."""
         with suppress(Exception):
             self._hand_over()
         with suppress(Exception):
@@ -231,7 +233,7 @@ class BagWriter:
             reason = getattr(error, 'strerror', None) or str(error)
             raise DataError(
                 f'{self.path}: cannot be written any more ({reason}); make room, and convert it: '
-                'what was written can be recovered'
+                'the written messages can be recovered'
             ) from None
 
 
@@ -261,11 +263,11 @@ def write_bag(
     """
     Write a record as a rosbag2 folder, or as a single file when `path` ends in .mcap or .db3.
 
-    The log time of a block is the time of its first sample.  Log times have to be positive and to
-    rise: whole seconds are added to them if the record starts before zero or its clock restarts.
-    The samples keep their own times.  The `storage` of a folder is mcap or sqlite3, mcap by
-    default; the custom data, such as seed and program, join the ``sample_rate`` in the metadata.
-    DataError if the place is taken or cannot be written to.
+    The log time of a block is the time of its first sample.  Log times must be positive and rise.
+    Whole seconds are therefore added to them if the record starts before zero or its clock
+    restarts.  The samples keep their own times.  The `storage` of a folder is mcap or sqlite3,
+    mcap by default.  The metadata hold ``sample_rate`` and the custom data, such as seed and
+    program.  Raises DataError if the place is taken or cannot be written to.
     """
     path = Path(path)
     suffix = {'.mcap': 'mcap', '.db3': 'sqlite3'}.get(path.suffix.lower())
@@ -307,7 +309,7 @@ def _write_pieces(writer: Writer, record: Record, block_size: int) -> None:
         columns = {'voltage': piece.v, 'displacement': piece.y}
         columns |= {quantity_of_channel(k): x for k, x in piece.channels.items()}
         first, last = (float(piece.time(k, k + 1)[0]) for k in (0, piece.n - 1))
-        # later by whole seconds, until the piece follows the piece before
+        # shift by whole seconds, until the piece follows the previous piece
         while first + shift < latest:
             shift += 1 + int(latest - first - shift)
         latest = last + shift
