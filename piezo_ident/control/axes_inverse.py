@@ -6,8 +6,9 @@ Invert a linear model of several axes by filters that look ahead.
 
     Q(f) = (G* G + epsilon^2)^-1 G*
 
-G maps motions at rest to motions of the stage, in spans, so it is one at rest.
-`piezo_ident.control.linear_inverse` explains the filter for one axis.
+Inputs and outputs of G are motions in spans.  The input is the motion that the voltages cause at
+rest, so the gain of G at rest is one.  `piezo_ident.control.linear_inverse` explains the filter
+for one axis.
 """
 
 from __future__ import annotations
@@ -101,8 +102,8 @@ def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, A
             return inverse, passed
         n *= 2
     raise ModelError(
-        f'these modes have no inverse of less than {LONGEST} samples: a zero of theirs dies away '
-        'too slowly; diagnose again with longer periods'
+        f'these modes have no inverse of less than {LONGEST} samples: a zero of the modes dies '
+        'away too slowly; diagnose again with longer periods'
     )
 
 

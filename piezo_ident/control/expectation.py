@@ -4,9 +4,9 @@
 """
 Predict the error of a stage under the voltage of an inverse.
 
-The prediction has two parts.  The shape of the motion errs as the model does: a diagnosis fits the
-zero of each record, so the error of a model holds for the shape alone.  The zero of the stage is
-shifted by creep from earlier motion, which a model with creep predicts.
+The prediction has two parts.  The first part is the error of the shape of the motion.  This is the
+known error of the model, because a diagnosis fits the zero of each record.  The second part is the
+shift of the zero by creep from earlier motion.  A model with creep predicts this shift.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Expectation:
     """
     Expected error of a stage [m].
 
-    `rms` is the error without its mean, None if the error of the model is unknown.  `offset` is
-    the mean error, None for a model without creep.
+    `rms` is the error about its mean; it is None if the error of the model is unknown.  `offset`
+    is the mean error; it is None if the model lacks creep.
     """
 
     rms: float | None
@@ -69,8 +69,8 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
             )
         if _is_slow(model):
             warnings.append(
-                'the record of the identification held no fast motion, so the expected error '
-                'holds for motion as slow as in that record; identify with steps or noise'
+                'the record of the identification held no fast motion; the expected error holds '
+                'for motion as slow as in that record; identify with steps or noise'
             )
     if late.size and abs(late[0]) >= limit:
         low = model.scaling.range[0]

@@ -6,10 +6,10 @@ Invert H sample by sample.
 
 Given the memory of H, its next value is a function of the next voltage alone.  This function
 rises if H has an inverse.  Each sample is therefore a root in one unknown.  Newton steps within a
-bracket find it, starting at the sample before; then the memory moves on under the voltage that was
-found.  This works for every law of H.  H may fall within its narrowest plays after a turn of the
-voltage.  Straight lines then replace these plays, or the voltage would jump at each small turn,
-even at rest.
+bracket find the root, starting at the sample before.  The memory then moves on under this voltage.
+This works for every law of H.  After a turn of the voltage, H may fall until its narrowest plays
+move.  Straight lines then replace these plays, because otherwise the voltage would jump at each
+small turn, even at rest.
 
 For a sum of plays without a cubic the inverse is a sum of plays again:
 K. Kuhnen, "Modeling, identification and compensation of complex hysteretic nonlinearities",
@@ -38,15 +38,15 @@ TRIALS = 80
 FLAT = 1e-6
 #: number of voltages at which H is checked beyond its span
 FINE = 513
-#: largest threshold of a play that a line may replace, as a share of the span; taste: a real loop
-#: is several times as wide, and a line errs by half the threshold
+#: largest threshold of a play that a line may replace, as a share of the span (taste).  A line
+#: errs by half the threshold, and a real loop is several times as wide
 NARROW = 0.02
 
 
 @kernel
 def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tuple[float, float]:
     """
-    Sum the plays of H at u; the sum and its slope.  `after` takes their outputs.
+    Compute the sum of the plays of H at u and its slope; write the plays to `after`.
 
     Each play may lag u by ``band[0]`` and lead it by ``band[1]``.
     """
@@ -63,7 +63,7 @@ def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tupl
 def _wide_plays(
     u: float, band: Array, q: Array, low: float, c: Array, memory: Array, after: Array
 ) -> tuple[float, float]:
-    """Sum plays with curves and bias as `_plays` does; one loop is a third faster than two."""
+    """Do the same as `_plays` with curves and bias; one loop is a third faster than two."""
     w, slope = 0.0, 0.0
     for i in range(q.size):
         f = held(memory[i], u - band[0, i], u + band[1, i])
@@ -78,7 +78,7 @@ def _wide_plays(
 @ordered_kernel
 def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
     """
-    Sum the lags along the path at u; the sum and its slope.  `after` takes their outputs.
+    Compute the sum of the lags along the path at u and its slope; write the lags to `after`.
 
     Equals `piezo_ident.operators.kernels.relaxing` for a single sample.
     """
@@ -287,10 +287,9 @@ class HysteresisInverse:
 
 def rising(hysteresis: Hysteresis, volts: Callable[[float], float] = float) -> Hysteresis:
     """
-    Replace as few of the narrowest plays by lines as make H rise with the voltage.
+    Make H rise with the voltage: replace its narrowest plays by lines, as few as possible.
 
-    Raises ModelError if H falls all the same; `volts` converts the normalised voltage that the
-    message names.
+    Raises ModelError if H still falls; `volts` converts the normalised voltage in the message.
     """
     low, high = hysteresis.span
     narrow = int(np.sum(hysteresis.thresholds <= NARROW * (high - low)))
@@ -329,7 +328,7 @@ def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ..
 
 
 def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
-    """Cut the limits to the range in which H rises, at most one span beyond the identified one."""
+    """Cut the limits to the range in which H rises, at most one span beyond the span of H."""
     least, most = hysteresis.span
     if not -np.inf < low < high < np.inf or least <= low < high <= most:
         return low, high

@@ -35,7 +35,7 @@ def checked_motion(wanted: ArrayLike) -> Array:
 
 
 def _vector(values: ArrayLike) -> Array:
-    """Convert values to a vector: empty if they are no numbers, NaN where they are masked."""
+    """Convert numbers to a vector, with NaN for a masked number; empty for other values."""
     try:
         given: Any = np.ma.asarray(values)
         if given.ndim == 1 and np.isrealobj(given):

@@ -54,15 +54,15 @@ EXACT = 1e-5
 WORTH = 0.9
 #: smallest share of a step that is tried
 SHORTEST = 0.2
-#: error that counts as a miss, as a share of the span of the motion; spans above the second number
-#: [spans of the model] count as that number
+#: A larger error than `MATTERS`, as a share of the span of the motion, counts as a miss.  A span
+#: above `LARGE` [spans of the model] counts as `LARGE`
 MATTERS, LARGE = 1e-3, 0.1
 #: span of a constant motion, normalised
 STANDS = 1e-9
 #: difference of two neighbouring samples that is a jump [of the span of the motion]
 JUMPS = 0.05
-#: changes of the voltage [of the span of the model] below which the lead is cut off, largest
-#: first; the cut may move the motion by at most the last number [of its span]
+#: The lead is cut off while the voltage changes by less than a number of `STILL` [of the span of
+#: the model], tried in this order.  The cut may move the motion by at most `RESTS` [of its span]
 STILL, RESTS = (1e-5, 1e-6, 1e-7, 1e-8), 1e-4
 
 
@@ -91,14 +91,15 @@ class Inverse(Showable):
         100 rms(wanted - predicted) / (max wanted - min wanted), without the lead: the error of the
         inversion alone.  For a constant motion the span of the model replaces the denominator.
     expected : float or None
-        Error of the stage that the model lets expect, without its mean [% as `error`].  It adds
-        the error of the model on its worst kind of motion (from its diagnosis or identification),
-        the motion above the lowest mode, and late creep.  None if the model has no known error.
+        Expected error of the stage about its mean [% as `error`]; None if the error of the model
+        is unknown.  The squares of three parts add up: the error of the model on its worst kind
+        of motion (from its diagnosis or identification), the motion above the lowest mode, and
+        late creep.
     expected_rms : float or None
         The same in metres.
     expected_offset : float or None
         Mean error of the stage through late creep, if it waits for one second at the beginning
-        [m].  None for a model without creep.
+        [m]; None if the model lacks creep.
     warnings : tuple of str
 
     Examples
@@ -143,7 +144,7 @@ def invert(
     like: Inverse | None = None,
 ) -> Inverse:
     """
-    Return the voltage under which a model of one axis moves as wanted; see `piezo_ident.invert`.
+    Find the voltage under which a model of one axis moves as wanted; see `piezo_ident.invert`.
 
     Parameters
     ----------
@@ -165,7 +166,7 @@ def invert(
     Raises
     ------
     DataError
-        When the wanted motion is no vector of finite numbers, or the limits do not reach it.
+        When the wanted motion is out of reach, or is not a vector of finite numbers.
     ModelError
         When the model has no inverse.
     """
@@ -258,7 +259,8 @@ class _Pass(NamedTuple):
     """
     One pass of the iteration, normalised; all of shape (n,).
 
-    Voltage, error of the model under it, samples whose H is out of reach, and H that was reached.
+    `error` is the error of the model under the voltage `u`.  `missed` marks samples whose H is out
+    of reach, and `reached` is H.
     """
 
     u: Array
@@ -274,7 +276,7 @@ def _task(
     clip: bool,
     channels: Mapping[str, ArrayLike],
 ) -> tuple[_Task, tuple[str, ...]]:
-    """Prepare the inversion within bounds (lowest, highest voltage, slew); warnings about H."""
+    """Prepare the inversion within bounds (lowest, highest voltage, slew), and warn about H."""
     s, (low, high, slew) = model.scaling, bounds
     inverted, warnings = with_rising_hysteresis(model)
     ends = float(s.u(low)), float(s.u(high))
@@ -282,8 +284,8 @@ def _task(
     Q = linear_inverse(linear, iterated=True)
     if not s.v(H.limits[0]) < s.v(H.limits[1]):
         raise DataError(
-            f'invert: the limits lie beyond what the model holds for, {s.range[0]:g} .. '
-            f'{s.range[1]:g} V; give others'
+            f'invert: the limits lie outside {s.range[0]:g} .. {s.range[1]:g} V, for which the '
+            'model holds; give others'
         )
     rest, around = rest_at(model, y, H.limits, clip), (Q.ahead, Q.behind)
     x = np.pad(s.x(y), around, mode='edge')
@@ -303,7 +305,7 @@ def _task(
 
 
 def _iterate(task: _Task) -> tuple[_Pass, int]:
-    """Iterate until the error falls no more; the best pass, and the number of passes."""
+    """Iterate until the error stops falling; return the best pass and the number of passes."""
     s = task.model.scaling
     counts = np.ones(task.x.size, dtype=np.bool_)
     w = task.H.reset(task.rest) + task.Q(task.x - task.x[0])
@@ -336,7 +338,7 @@ def _iterate(task: _Task) -> tuple[_Pass, int]:
 def _without_rest(
     task: _Task, best: _Pass, size: int, limits: tuple[float, float]
 ) -> tuple[slice, Array, Array]:
-    """Cut off the tail and the part of the lead at rest: samples, voltage and displacement."""
+    """Cut off the tail and the lead at rest; return samples, voltage and displacement."""
     s, lead = task.model.scaling, task.Q.ahead
     for still in (*STILL, 0.0):
         moves = np.flatnonzero(np.abs(best.u - task.rest) > still * min(task.span, 1.0))
@@ -355,7 +357,7 @@ def _without_rest(
 def _out_of_reach(
     task: _Task, best: _Pass, used: slice, missed: Mask, most: float, slew: float
 ) -> str:
-    """Say which samples the limits do not reach, by how much [m], and what to change."""
+    """Describe the samples out of reach, their largest error `most` [m], and a remedy."""
     s, (low, high) = task.model.scaling, task.H.limits
     x, t = task.x[used], task.t[used][missed]
     at_top = best.u[used][missed] > 0.5 * (low + high)
@@ -376,7 +378,7 @@ def _out_of_reach(
 def _of_hysteresis(
     model: StageModel, ends: tuple[float, float], step: float
 ) -> tuple[HysteresisInverse | RateInverse, StageModel]:
-    """Invert H with plays that widen or an amplifier lag; the model of the remaining parts."""
+    """Invert H with plays that widen or an amplifier lag; return the other parts as a model."""
     h, rate, pole, linear = model.hysteresis, model.sample_rate, 0.0, model
     wide = [s for s in model.effects if s.name == RateDependentHysteresis.name]
     lag = [s for s in model.effects_in('input') if s.name == AmplifierLag.name]

@@ -6,12 +6,12 @@ Learn a repeated motion: correct each run by the measured error of the best run 
 
     r <- r + s F (y_wanted - y),        u = inverse model of r
 
-F is a low-pass without phase.  It protects the stage above the lowest mode that rings, where the
-model is uncertain and a correction may do harm.  The repeatable error falls from run to run;
-noise stays.  Learning therefore keeps the best run, and ends when the error falls no more.  A
-worse run halves the step s.  A change of the mean alone does not, because creep moves the mean
-from run to run.  If the error falls slowly, it lies above the corner of F, and the corner grows
-until a run becomes worse.
+F is a low-pass without phase.  F protects the stage above the lowest mode that rings, where the
+model is uncertain and a correction may do harm.  The repeatable error falls from run to run; noise
+stays.  Learning therefore keeps the best run, and ends when the error stops falling.  A worse run
+halves the step s.  A run in which the mean alone is worse keeps the step, because creep moves the
+mean from run to run.  If the error falls slowly, it lies above the corner of F, and the corner
+grows until a run becomes worse.
 D. A. Bristow, M. Tharayil and A. G. Alleyne, "A survey of iterative learning control", IEEE
 Control Systems Magazine 26(3), 2006, doi:10.1109/MCS.2006.1636313.
 """
@@ -39,7 +39,7 @@ from piezo_ident.record.readings.jumps import least_step, wild_readings
 WORTH = 0.95
 #: smallest step that is tried after a worse run
 SMALLEST = 0.2
-#: lowest correlation of measured and predicted displacement at which both are one stage
+#: lowest correlation of measured and predicted displacement at which they count as one stage
 WITH = 0.5
 #: corner of F, as shares of the lowest mode that rings and of the sampling rate
 OF_MODE, OF_RATE = 0.7, 0.1
@@ -75,8 +75,8 @@ class Learning:
     slew : float, optional
         Largest speed of the voltage [V/s].
     clip : bool, optional
-        Come as near to the motion as the limits allow, instead of refusing it.  Samples out of
-        reach are neither learned nor counted.
+        Come as near to the motion as the limits allow, instead of refusing it.  Corrections and
+        errors leave out the samples out of reach.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     corner : float, optional
@@ -88,7 +88,7 @@ class Learning:
     drive : Inverse
         The next voltage to play; its `wanted` is the corrected motion.
     repetitions : list of Repetition
-        So far.
+        Runs so far.
 
     Raises
     ------
@@ -154,7 +154,7 @@ class Learning:
 
     @property
     def is_done(self) -> bool:
-        """Return whether the error falls no more."""
+        """Whether the error has stopped falling."""
         errors, shapes = [r.error for r in self.repetitions], self._shapes
         if len(errors) < 2 or errors[-1] <= WORTH * min(errors[:-1]):
             return False
@@ -177,8 +177,8 @@ class Learning:
         Raises
         ------
         DataError
-            When there are more or fewer samples, one is not finite, they are far off, or they do
-            not move as the model does.
+            When the number of samples is wrong, a sample is not finite, or the displacement is
+            far off or moves unlike the model.
         """
         drive = self.drive
         try:
@@ -200,7 +200,7 @@ class Learning:
             raise DataError(f'learning: {doubt}')
         error = percent(float(np.sqrt(np.mean(e[self._counts] ** 2))), self._span)
         self.repetitions.append(Repetition(drive, y, error))
-        # creep moves the mean from run to run; the correction is not to blame
+        # judge the shape, too: creep, not the correction, moves the mean from run to run
         shape, before = percent(float(np.std(e[self._counts])), self._span), self._shapes
         self._shapes = [*before, shape]
         if error <= self.best.error or shape <= min(before):
@@ -232,7 +232,7 @@ class Learning:
             return
         pieces = [(y, self.drive.predicted)]
         yield from doubts(pieces, self._model_span)
-        # the displacement of another axis is neither opposed to the model nor like it
+        # the displacement of another axis hardly correlates with the model
         if runs_against(pieces, self._model_span, below=WITH):
             yield REVERSED
 

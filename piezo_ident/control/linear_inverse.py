@@ -11,11 +11,10 @@ filter that knows the wanted motion some time ahead has neither limit.  Above th
 hardly moves; epsilon keeps the voltage small there.  A model from data is uncertain there as well:
 full compensation of the corners of a scan makes the real stage ring.
 
-The method is the stable inversion of S.  Devasia, D.  Chen and B.  Paden, "Nonlinear
-inversion-based output tracking", IEEE Trans.  Automatic Control 41(7), 1996, doi:10.1109/9.508898,
-for a linear system, with the weight on the voltage of S.  Devasia, "Should model-based inverse
-inputs be used as feedforward under plant uncertainty?", ibid.  47(11), 2002,
-doi:10.1109/TAC.2002.804478.
+The method is the stable inversion of S. Devasia, D. Chen and B. Paden, "Nonlinear inversion-based
+output tracking", IEEE Trans. Automatic Control 41(7), 1996, doi:10.1109/9.508898, for a linear
+system.  The weight on the voltage is that in S. Devasia, "Should model-based inverse inputs be
+used as feedforward under plant uncertainty?", ibid. 47(11), 2002, doi:10.1109/TAC.2002.804478.
 """
 
 from __future__ import annotations
@@ -53,9 +52,9 @@ SHORTEST, LONGEST, OF_DELAY = 1 << 11, 1 << 19, 8
 #: past of a shortened filter: largest truncated part, as a share of the sum of its magnitudes,
 #: and most samples
 MISSED, MOST_BEHIND = 1e-6, 8192
-#: poles below this corner [1 / `LONGEST`] are too slow for the longest filter: a quarter of it
-#: must hold the time constants that `OUTSIDE` takes.  The second number is the largest share of
-#: such poles in the static gain that an iteration corrects; taste
+#: Poles below the corner `SLOW` [1 / `LONGEST`] are too slow for the longest filter, a quarter of
+#: which must hold the time constants that `OUTSIDE` takes.  An iteration corrects slow poles with
+#: at most the share `LITTLE` of the static gain (taste)
 SLOW, LITTLE = -4.0 * math.log(OUTSIDE) / (2.0 * math.pi), 0.2
 #: damping below which a mode rings
 RINGS = 0.2
@@ -124,9 +123,10 @@ def cut(size: Array, last: float) -> tuple[float, Cut | None]:
     Returns
     -------
     left : float
-        Share of the ends: the outer quarters.  Empty ends prove that nothing wrapped around.
+        Share of the ends: the outer quarters.  If the ends are empty, the filter has not wrapped
+        around.
     cut : Cut or None
-        None if the filter is too short.
+        The used taps, or None for too short a filter.
     """
     n = len(size)
     before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
@@ -160,7 +160,7 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
-        raise ModelError('this model has no inverse: its G is without a static gain')
+        raise ModelError('this model has no inverse: the static gain of G is zero or infinite')
     n = SHORTEST
     # a longer delay would wrap around
     while n < OF_DELAY * model.total_delay.samples:
@@ -186,8 +186,8 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
     slowest = min(radii, key=lambda r: abs(r - 1.0), default=0.0)
     raise ModelError(
         f'this model has no inverse of less than {LONGEST} samples: its delay is '
-        f'{model.total_delay.total:g} samples, and the pole or zero of G that dies away last has '
-        f'the radius {slowest:.6f}; identify again with a lower order'
+        f'{model.total_delay.total:g} samples, and the slowest pole or zero of G has the radius '
+        f'{slowest:.6f}; identify again with a lower order'
     )
 
 

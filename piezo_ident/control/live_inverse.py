@@ -89,8 +89,8 @@ class LiveInverse:
     preview, passes : int
         Samples ahead, and number of passes that share them.
     error : float
-        100 rms(wanted - reached) / (max wanted - min wanted) of the model on a trial motion of
-        two slow sines [%]: the error through the finite preview and number of passes.
+        Error through the finite preview and number of passes [%].  It is 100 rms(wanted -
+        reached) / (max wanted - min wanted) of the model on a trial motion of two slow sines.
     position : float
         Displacement of the stage at rest [m].
     warnings : tuple of str
@@ -100,7 +100,7 @@ class LiveInverse:
     DataError
         When the limits are crossed, or rest lies outside of them.
     ModelError
-        When the model has no inverse, or the preview does not reach beyond its delay.
+        When the model has no inverse, or the preview is too short for its delay.
 
     Examples
     --------
@@ -215,7 +215,7 @@ class LiveInverse:
         v : ndarray, shape (n,)
             [V]
         tick : int, optional
-            Samples since the clock of the voltage was zero, at the first one.
+            Clock of the voltage at the first sample [samples].
         """
         for p in self._passes:
             y = p.follow(v, tick)
@@ -238,7 +238,7 @@ class LiveInverse:
         Raises
         ------
         DataError
-            When the wanted motion is no vector of finite numbers.
+            When the wanted motion is not a vector of finite numbers.
         """
         y = np.asarray(wanted, dtype=np.float64)
         if y.ndim != 1 or not np.isfinite(y).all():
@@ -257,7 +257,7 @@ class _Pass:
     """
     One pass of the iteration with its own filter, H^-1 and model, behind the pass before it.
 
-    It waits for `wait` samples more than it needs; `left` passes come after it.
+    The pass waits for `wait` samples more than it needs; `left` passes come after it.
     """
 
     def __init__(
@@ -314,8 +314,8 @@ class _Pass:
         Process the samples that are known far enough ahead, and return the input of the next pass.
 
         x, d and w, shape (n,), are wanted motion, error and H before this pass, normalised.  The
-        result is x, d and w after this pass, the normalised voltage u, and the samples at which
-        H could not reach its goal; all of shape (m,).
+        result is x, d and w after this pass, the normalised voltage u, and a mask of the samples
+        at which H missed its goal; all of shape (m,).
         """
         x, d, w = (np.append(*z) for z in ((self._x, x), (self._d, d), (self._w, w)))
         n = max(x.size - self._ahead, 0)
@@ -355,5 +355,5 @@ def _without_channels(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
     names = ', '.join(setting.name for setting in left)
     kept = tuple(setting for setting in model.effects if setting not in left)
     return replace(model, effects=kept), (
-        f'{names} is not made up for: a further channel is not known ahead',
+        f'{names} is not made up for: its channel is unknown ahead',
     )

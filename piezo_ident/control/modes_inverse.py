@@ -10,10 +10,10 @@ y(u) is the free run of the modes.  Q inverts a linear model of them by filters 
 see `piezo_ident.control.axes_inverse`.  P = G Q is nearly one where the stage moves, and small
 above its modes.  The iteration therefore leaves alone the motion that is too fast for the stage.
 
-Softening and plays are no part of a linear model.  A first pass runs the modes under the inverse
-without them.  Each signal z then gets a gain k.  The gain is chosen such that k z is nearest to
-the push p of this run.  The other passes invert the linear model with these gains.  The gains are
-the statistical linearisation of A. Gelb and W. E. Vander Velde, Multiple-Input Describing
+A linear model lacks softening and plays.  The first pass inverts the linear model without them,
+and runs the modes under this voltage.  Each signal z then gets the gain k for which k z is nearest
+to its push p in this run.  The other passes invert the linear model with these gains.  The gains
+are the statistical linearisation of A. Gelb and W. E. Vander Velde, Multiple-Input Describing
 Functions and Nonlinear System Design, 1968.
 
 The passes are combined by the acceleration of D. G. Anderson, "Iterative procedures for nonlinear
@@ -43,7 +43,7 @@ from piezo_ident.model.multi_axis import alone, MultiAxisModel
 from piezo_ident.operators.chain import Block
 from scipy.ndimage import maximum_filter1d
 
-#: most passes, and passes in turn without a better one that end the iteration (taste)
+#: most passes; `STALLS` passes in turn without a better pass end the iteration, too (taste)
 PASSES, STALLS = 40, 6
 #: rms error [of the span of the wanted motion] at which the iteration ends
 EXACT = 1e-5
@@ -83,7 +83,7 @@ def invert_modes(
     ----------
     model : MultiAxisModel
     modes : SharedModes
-        Of the model.
+        Shared modes of the model.
     wanted : mapping of str to ndarray, shape (n,)
         Displacement by axis [m].
     limits, slew, clip, sample_rate
@@ -101,7 +101,7 @@ def invert_modes(
     DataError
         When the limits do not reach the wanted motion.
     ModelError
-        When the modes have no inverse, or the iteration does not contract.
+        When the modes lack an inverse, or the iteration does not contract.
     """
     if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
         raise DataError(
@@ -145,12 +145,12 @@ class _Task:
         self.step = float(bounds[0, 2])
         self.static = self.whole[:, None] * static_gain(modes.linear, self.whole)
         size = max(x.size for x in wanted.values())
-        # an axis without a motion rests where its voltage is that of the fit
+        # an axis without a wanted motion rests under its voltage of the fit
         columns = [wanted.get(a, np.full(size, np.nan)) for a in self.axes]
         self.rest, first = self._rest(np.array([x[0] for x in columns]))
         self.y = np.where(np.isnan(columns), first[:, None], columns).T
         moved = np.ptp(self.y, axis=0)
-        # one at rest counts as the one that moves most
+        # an axis at rest gets the span of the axis that moves most
         moves = moved > STANDS * self.whole
         self.spans = np.where(moves, moved, moved.max() if moves.any() else self.whole)
         self.small = MATTERS * np.minimum(self.spans, LARGE * self.whole)
@@ -160,7 +160,7 @@ class _Task:
         """
         Find the voltages about v0 under which the modes rest at a goal, and where they rest.
 
-        Axes whose goal is NaN have the voltage of the fit.
+        Axes with the goal NaN keep the voltage of the fit.
         """
         u, free = np.zeros(len(goal)), ~np.isnan(goal)
         for _ in range(STEPS):
@@ -238,7 +238,7 @@ class _Filters:
         return _Pass(u, error, short, float(np.sqrt(np.mean(within**2))), passes)
 
     def correction(self, now: _Pass) -> Array:
-        """Compute the step of the iteration [m]: what P passes of the error within reach."""
+        """Compute the step of the iteration [m]: filter the error within reach by P."""
         near = maximum_filter1d(now.missed.any(axis=1), 2 * self.Q.reach + 1)
         return self.P(np.where(near[:, None], 0.0, now.error))
 
@@ -251,7 +251,7 @@ class _Solved(NamedTuple):
 
 
 def _iterated(task: _Task) -> _Solved:
-    """Iterate until the error falls no more, or raise ModelError if it does not fall."""
+    """Iterate until the error stops falling; raise ModelError if it never falls."""
     first = _Filters.of(task, np.zeros(task.modes.signals))
     begun = first.tried(task, first.x, 1)
     filters, best = first, begun
@@ -288,7 +288,7 @@ def _gains(modes: SharedModes, u: Array) -> Array:
 
 
 class _Anderson:
-    """Combines steps so that what they leave is least."""
+    """Combine earlier steps such that the remaining error is smallest."""
 
     def __init__(self) -> None:
         self._points, self._steps = list[Array](), list[Array]()
@@ -372,7 +372,7 @@ def _of_axis(task: _Task, j: int, drive: _Drive, late: list[str], clip: bool) ->
 
 
 def _level_warnings(task: _Task, u: Array) -> list[str]:
-    """Warn of motions larger than those of the fit, whose softening is not known."""
+    """Warn of larger motion than in the fit, because its softening is unknown."""
     if not task.modes.levels:
         return []
     high, level = task.modes.range[1], np.sqrt(task.modes.run(u).level)

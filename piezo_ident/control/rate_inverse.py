@@ -5,9 +5,9 @@
 Invert H with plays that widen with speed.
 
 With known thresholds each sample is a root in one unknown, as for H alone.  The thresholds depend
-on the speed of the unknown voltage.  A pass takes the speed of the voltage that the pass before
-found, smoothed.  An exact solution for voltage and speed together is useless: a faster voltage
-widens the plays by more than it moves them, so the root jumps from sample to sample.
+on the speed of the unknown voltage.  Each pass takes the smoothed speed of the voltage from the
+previous pass.  An exact solution for voltage and speed together is useless, because it jumps from
+sample to sample: a faster voltage widens the plays by more than it moves them.
 
 The passes do not converge if plays widen much.  The voltage must then change before a turn, as
 before a zero outside the unit circle.  Gauss-Newton steps correct the whole voltage in this case;
@@ -124,7 +124,7 @@ class RateInverse:
         return best[1:]
 
     def _passed(self, w: Array) -> _Found:
-        """Repeat passes, each with the speed of the pass before; the best one."""
+        """Repeat passes, each with the speed of the previous pass; return the best pass."""
         u, reached = self._inverse.process(w)
         best, passes = (self._left(u, w), u, reached), PASSES
         if self._before.size == w.size:
@@ -142,7 +142,7 @@ class RateInverse:
         return best
 
     def _corrected(self, w: Array, u: Array, steps: int, best: _Found) -> _Found:
-        """Correct a voltage by Gauss-Newton steps; the best result, `best` included."""
+        """Correct a voltage by Gauss-Newton steps; return the best result, or `best`."""
         n = w.size
         for _ in range(steps):
             J = tangent(self._effect, u, self._u0)

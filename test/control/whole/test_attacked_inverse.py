@@ -49,7 +49,7 @@ def circle(radius, angle):
         (SINE, {'limits': 10.0}, 'lowest, highest'),
         (SINE, {'limits': (10.0, 0.0)}, 'lowest, highest'),
         (SINE, {'limits': ('low', 'high')}, 'lowest, highest'),
-        (SINE, {'limits': (30.0, 40.0)}, 'beyond what the model holds for, 0 .. 10 V'),
+        (SINE, {'limits': (30.0, 40.0)}, 'outside 0 .. 10 V, for which the model holds'),
         (SINE, {'limits': (5.0, 5.0 + 1e-9)}, 'starts at 15 um; between 5 and 5 V'),
         (SINE, {'slew': 0.0}, 'a slew above zero'),
         (SINE, {'slew': None}, 'a slew above zero'),
@@ -70,7 +70,7 @@ def test_what_has_no_inverse_is_named():
     h = Hysteresis(PAPER.hysteresis.thresholds, PAPER.hysteresis.weights, -0.8, 1.1)
     with pytest.raises(ModelError, match=r'no inverse: its slope falls to -1\.3'):
         pi.invert(replace(PAPER, hysteresis=h), SINE)
-    with pytest.raises(ModelError, match='without a static gain'):
+    with pytest.raises(ModelError, match='static gain of G is zero'):
         pi.invert(replace(PAPER, dynamics=Dynamics([0.5], [1.0, -1.0])), SINE)
     with pytest.raises(ModelError, match=r'this model .* 0\.99999'):
         pi.invert(replace(PAPER, dynamics=drifting(0.5)), SINE)
