@@ -46,7 +46,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     given = load(args.model_file)
     records, validation = read_both(paths, further, args, console)
     for record in validation:
-        # refused now: these records are predicted after the long work
+        # a wrong rate is refused before the long work
         with naming(record.name):
             for piece in record:
                 given.check_rate(piece)
@@ -103,8 +103,8 @@ def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:
     used = given.identification.get('records')
     known = used if isinstance(used, Sequence) else ()
     return [
-        f'{record.name}: the model was identified from a record of this name; if it is the same, '
-        'its error says nothing about other motion: give a record that took no part'
+        f'{record.name}: the model was identified from a record of this name. The error on the '
+        'same record says nothing about other motion; give another record'
         for record in records
         if record.name in known
     ]
@@ -113,6 +113,6 @@ def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:
 def _settings(args: SimpleNamespace) -> DiagnosisSettings:
     only, without = effect_names(args.only), effect_names(args.without)
     if not set(only or catalogue()) - set(without):
-        raise ConfigError('--only and --without leave no candidate; name one that is not in both')
+        raise ConfigError('--only and --without leave no candidate; give --without fewer effects')
     named = {**fields_of(args, DiagnosisSettings), 'effects': only or None, 'without': without}
     return DiagnosisSettings(**named)

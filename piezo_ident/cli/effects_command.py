@@ -60,7 +60,7 @@ def _about(effect: type[Effect]) -> str:
 
 
 def _documentation(effect: type[Effect]) -> str:
-    # `inspect.getdoc` would give a plug-in without a docstring the text of the base class
+    # for a plug-in that lacks a docstring, `inspect.getdoc` would take the text of the base class
     return inspect.cleandoc(effect.__doc__ or '')
 
 

@@ -110,12 +110,13 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
-    """Refuse options for bags if all records are tables, and the other way round."""
+    """Refuse options for bags if all records are tables, and options for tables if all bags."""
     tables = all(p.is_file() and not storage_of(p) for p in paths)
     for option in ('namespace', 'voltage_topic', 'displacement_topic'):
         if tables and getattr(args, option, None) is not None:
             raise ConfigError(
-                f'--{option.replace("_", "-")} is for bags, and {paths[0]} is none; leave it out'
+                f'--{option.replace("_", "-")} is for bags, and {paths[0]} is a table; leave it '
+                'out'
             )
     bags = all(p.is_dir() or storage_of(p) for p in paths)
     for option in ('columns', 'rate', 'time_unit', 'voltage_unit'):
@@ -160,7 +161,7 @@ def read_all(
                 'piezo_ident convert --displacement-unit um IN OUT.npz'
             ) from None
         records.append(record.renamed(str(path)) if names[path.name] > 1 else record)
-    # reported before the work, which a wrong unit may let fail
+    # reported before the work, which may fail through a wrong unit
     shown: dict[Fault, list[Record]] = {}
     for record in records:
         for fault in record.faults:
@@ -251,7 +252,7 @@ def check_file(path: Path, *, overwrite: bool, folder_too: bool = False) -> None
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder in which files cannot be written; it may be missing still."""
+    """Refuse a folder in which files cannot be written; the folder may still be missing."""
     check_link(path)
     try:
         if path.exists() and not path.is_dir():

@@ -124,7 +124,7 @@ cli = Verbs(
         click.Option(
             ['--completion'],
             type=click.Choice(['bash', 'zsh', 'fish']),
-            help='Print what makes a shell complete: eval "$(piezo_ident --completion bash)"',
+            help='Print the completion of a shell: eval "$(piezo_ident --completion bash)"',
             is_eager=True,
             expose_value=False,
             callback=_completion,
@@ -133,8 +133,8 @@ cli = Verbs(
     commands=[
         Verb(
             'simulate',
-            f'Make a record with the simulated stage.\n\n{OUT_HELP} As a .yaml file the program '
-            'itself is written, scaled to the limits, for the excitation node.',
+            f'Make a record with the simulated stage.\n\n{OUT_HELP} A .yaml file holds the '
+            'program itself, scaled to the limits, for the excitation node.',
             [options.OUT],
             {'Stage and program': options.SIMULATE, 'Output': options.OUTPUT},
             'simulate record.npz',
@@ -192,7 +192,7 @@ cli = Verbs(
         Verb(
             'diagnose',
             'Find the effect that a model lacks, and add it.\n\nMODEL is a model file; with '
-            f'--each also a folder with one of the name of every record. {RECORD_HELP}',
+            f'--each also a folder of model files with the names of the records. {RECORD_HELP}',
             [options.MODEL_FILE, options.RECORDS],
             {
                 'Outputs': options.RESULTS,
@@ -218,14 +218,14 @@ cli = Verbs(
             'node',
             params=[options.NODE, options.NODE_ARGUMENTS],
             callback=lambda **given: SimpleNamespace(verb='node', json=False, **given),
-            # what follows the name is for ROS
+            # the words after the name are for ROS
             context_settings={
                 **SETTINGS,
                 'ignore_unknown_options': True,
                 'allow_interspersed_args': False,
             },
-            help='Start a node without the tools of ROS.\n\nNAME is a node; without it they are '
-            'listed. ARGUMENTS are those of ROS.',
+            help='Start a node without the tools of ROS.\n\nNAME is a node; without NAME all '
+            'nodes are listed. ARGUMENTS are passed to ROS.',
             epilog=_examples(['node model --help', 'node model --ros-args -r __ns:=/stage_a']),
         ),
         Verb(
@@ -250,7 +250,7 @@ def _told(error: click.UsageError) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; default arguments are those of the process.  Return the exit code."""
+    """Run a command, by default with the arguments of the process; return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
 
     def stop(code: int, text: str, kind: str) -> int:

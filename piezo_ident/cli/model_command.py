@@ -109,7 +109,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
         unsure = [text for axis in others for text in unknown_parts(halves.get(axis, ()))]
         warnings = (*prediction_doubts(model, record), *unsure)
         lacks = f'displacement of {", ".join(unknown)}' if known else 'displacement'
-        console.say(f'{args.model} on {record.name}, which has no {lacks}: no error is known')
+        console.say(f'{args.model} on {record.name}, which has no {lacks}: the error is unknown')
         for warning in warnings:
             console.say(f'  warning: {warning}')
         data['warnings'] = list(warnings)
@@ -205,7 +205,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
 
 
 def _at_rate(model: StageModel | MultiAxisModel, rate: float) -> StageModel | MultiAxisModel:
-    """Give a model the rate of a motion that it takes: a static one holds for any."""
+    """Set the sampling rate of a model to that of a motion; a static model holds for any rate."""
     if isinstance(model, StageModel):
         return replace(model, sample_rate=rate)
     axes = {k: replace(x, sample_rate=rate) for k, x in model.axes.items()}
@@ -213,7 +213,7 @@ def _at_rate(model: StageModel | MultiAxisModel, rate: float) -> StageModel | Mu
 
 
 def _wanted(model: MultiAxisModel, reference: Record, console: Console) -> dict[str, Array]:
-    """Return the wanted motion of each axis; one motion alone is that of a single axis."""
+    """Return the wanted motion of each axis; a single motion belongs to a single axis."""
     (piece,) = reference
     wanted = {'y': piece.y, **{k: x for k, x in piece.channels.items() if role_of(k) == 'y'}}
     if len(wanted) == len(model.axes) == 1:
@@ -230,7 +230,7 @@ def _whole(reference: Record, model: StageModel | MultiAxisModel) -> Piece:
         met = '; '.join(str(fault) for fault in reference.faults if not fault.is_note)
         raise DataError(
             f'{reference.name}: falls into {1 + len(more)} pieces; {met}; a wanted motion is one '
-            'piece: fill in what is missing'
+            'piece: fill in the missing samples'
         )
     if not model.takes(piece):
         raise DataError(

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``node``: start a node without the tools of ROS, or tell what it does and its parameters."""
+"""``node``: start a node without the tools of ROS, or describe the node and its parameters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from piezo_ident.report.table import plain_text, Table
 
 def node_command(args: SimpleNamespace, console: Console) -> None:
     """``piezo_ident node``."""
-    # the nodes stand above the command line, and are imported by their name
+    # the room of the nodes is above the command line, so they are imported by name
     main = importlib.import_module('piezo_ident.nodes.main')
     if args.name is None:
         lines = [f'{name:12} {purpose}' for name, (*_, purpose) in main.NODES.items()]

@@ -21,7 +21,7 @@ from piezo_ident.record.options import parse_columns, scaled_unit, UNITS
 
 
 def _name(text: str) -> str:
-    # an empty shell variable, which as a path would mean the working folder
+    # an empty shell variable would mean the working folder
     if not text.strip():
         raise click.BadParameter(f'{text!r} is empty; give a name, or leave it out')
     if text.startswith('--'):
@@ -91,7 +91,7 @@ def _effects() -> Iterable[str]:
 
 
 def _option(name: str, kind: Any, metavar: str | None, text: str, **more: Any) -> click.Option:
-    # an absent option is None, so that the settings alone hold the defaults
+    # an absent option is None; the defaults stand in the settings
     more = {**(_among(tuple) if kind is _file else {}), **more}
     return click.Option([name], type=kind, metavar=metavar, help=text, **more)
 
@@ -105,8 +105,8 @@ def _unit_of(quantity: str, role: str) -> click.Option:
         return found
 
     text = (
-        f'Of {role} in the files (default: by the header, else {next(iter(known))}); '
-        f'with a number, as in 10{[*known][-2]}, what one of the file is, or one volt.'
+        f'Unit of {role} in the files (default: by the header, else {next(iter(known))}). '
+        f'With a number, as in 10{[*known][-2]}: the value of 1 in the file, or of one volt.'
     )
     return _option(f'--{quantity}-unit', unit, '|'.join(known), text)
 
@@ -145,17 +145,17 @@ READING = [
     _unit_of('time', 't'),
     _unit_of('voltage', 'v'),
     _unit_of('displacement', 'y'),
-    _option('--voltage-limits', float, 'LO HI', 'Refuse others [V].', nargs=2, callback=_limits),
-    _option('--namespace', _name, 'NAME', 'Of the topics of a bag.'),
+    _option('--voltage-limits', float, 'LO HI', 'Allowed range [V].', nargs=2, callback=_limits),
+    _option('--namespace', _name, 'NAME', 'Namespace of the topics of a bag.'),
     _option('--voltage-topic', _name, 'TOPIC', 'Topic of a bag with the voltage.'),
     _option('--displacement-topic', _name, 'TOPIC', 'Topic of a bag with the displacement.'),
 ]
 
 EACH = [
-    _option('--each', _file, 'DIR', 'Take every record on its own; what is done there is kept.'),
+    _option('--each', _file, 'DIR', 'Process every record on its own; finished results stay.'),
     _option('--jobs', _whole, 'N', 'Processes (default: one a core).'),
-    _option('--scheduler', _name, 'ADDRESS', 'Dask scheduler whose workers do it.'),
-    _flag('--reports', 'Write a report of every record too.'),
+    _option('--scheduler', _name, 'ADDRESS', 'Dask scheduler whose workers do the work.'),
+    _flag('--reports', 'Write a report of every record, too.'),
 ]
 
 RESULTS = [
@@ -191,7 +191,7 @@ INVERT = [
 EXPORT = [
     _option('--out', _file, 'FILE', 'Header .h or unit .fmu.'),
     _option('--format', click.Choice(['c', 'fmu']), None, 'Default: by the ending of FILE.'),
-    _option('--name', _name, 'NAME', 'With which names in it begin (default: that of the file).'),
+    _option('--name', _name, 'NAME', 'Start of all names in it (default: the name of the file).'),
     OVERWRITE,
 ]
 
@@ -205,7 +205,7 @@ MOTION = [
 #: limits of a voltage
 KEPT = [
     _option(
-        *('--limits', float, 'LO HI', 'Of the voltage [V] (default: the identified range).'),
+        *('--limits', float, 'LO HI', 'Range of the voltage [V] (default: the identified range).'),
         nargs=2,
         callback=_limits,
     ),
@@ -213,7 +213,7 @@ KEPT = [
 ]
 FEEDFORWARD = [
     *KEPT,
-    _option('--preview', _whole, 'N', 'Samples that the motion is known ahead, at most.'),
+    _option('--preview', _whole, 'N', 'Most samples by which the motion is known ahead.'),
 ]
 DRIVE = [*KEPT, _flag('--clip', 'Come as near as the limits allow, instead of refusing.')]
 
@@ -231,7 +231,7 @@ SIMULATE = [
         *('--program', _name, 'FILE', 'Program, or the name of one (default: identification).'),
         **_shipped('program_', 'identification'),
     ),
-    _option('--seed', _whole, 'N', "Of the sensor noise (default: the stage's own)."),
+    _option('--seed', _whole, 'N', "Seed of the sensor noise (default: the stage's own)."),
     _option('--sample-rate', float, 'HZ', "Sampling rate (default: the stage's own)."),
     _option(
         *('--limits', float, 'LO HI', "Scale the program to these [V] (default: the program's)."),
@@ -246,21 +246,21 @@ IDENTIFY = [
     _option(
         '--thresholds', _thresholds, 'N|auto', 'Number of plays (default: by held-out error).'
     ),
-    _option('--order', _order, 'NA,NB', 'Of G (default: searched).'),
-    _option('--max-order', _whole, 'N', 'Of the search (default: 15).'),
+    _option('--order', _order, 'NA,NB', 'Order of G (default: searched).'),
+    _option('--max-order', _whole, 'N', 'Largest order of the search (default: 15).'),
     _option('--delay', _whole, 'SAMPLES', 'Delay (default: identified).'),
     _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is held out.'),
-    _option('--solver', click.Choice(['least_squares', 'swarm']), None, 'Of the weights.'),
-    _flag('--polish', 'Let least squares finish what the swarm found.'),
-    _option('--seed', _whole, 'N', 'Of the swarm (default: 0).'),
+    _option('--solver', click.Choice(['least_squares', 'swarm']), None, 'Solver of the weights.'),
+    _flag('--polish', 'Let least squares finish the fit of the swarm.'),
+    _option('--seed', _whole, 'N', 'Seed of the swarm (default: 0).'),
 ]
 
 #: fields of `DiagnosisSettings`, and names of effects
 _SEVERAL = {'multiple': True, **_among(_effects)}
 DIAGNOSE = [
-    _option('--only', _name, 'NAME', 'Try this effect and no other; several times.', **_SEVERAL),
-    _option('--without', _name, 'NAME', 'Do not try this effect; several times.', **_SEVERAL),
-    _option('--most-effects', _whole, 'N', 'Effects that are added (default: 4).'),
-    _option('--most-samples', _whole, 'N', 'Searched, of the beginnings of the records.'),
-    _option('--seed', _whole, 'N', 'Of what is drawn (default: 0).'),
+    _option('--only', _name, 'NAME', 'Try only this effect; may be repeated.', **_SEVERAL),
+    _option('--without', _name, 'NAME', 'Leave out this effect; may be repeated.', **_SEVERAL),
+    _option('--most-effects', _whole, 'N', 'Most effects that are added (default: 4).'),
+    _option('--most-samples', _whole, 'N', 'Most samples searched, from the starts of records.'),
+    _option('--seed', _whole, 'N', 'Seed of random numbers (default: 0).'),
 ]

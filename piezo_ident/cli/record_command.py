@@ -96,7 +96,7 @@ def _record_of(
     seed: int | None,
     name: str,
 ) -> Record:
-    """Play the sequences on the stage, or without a seed make a record of the voltages alone."""
+    """Play the sequences on the stage; without a seed, make a record of the voltages alone."""
     if seed is None:
         first, *others = sequences
         channels = {f'v_{axis}': q.v for axis, q in zip(stage.axes[1:], others, strict=True)}
@@ -133,14 +133,14 @@ def _refuse_unused(args: SimpleNamespace) -> None:
         raise DataError(f'{args.out}: a storage is for bags only; leave it out')
     if args.seed is not None:
         raise ConfigError(
-            f'{args.out}: --seed is of the sensor noise, and nothing is measured; leave it out, '
-            'and write the seed of noise and multisines into the program'
+            f'{args.out}: --seed is for the sensor noise of a record; leave it out, and write the '
+            'seed of noise and multisines into the program'
         )
 
 
 def _write_program(out: Path, program: Program, axes: int, console: Console) -> None:
     text = program_to_yaml(program)
-    every = build_axes(program, axes)  # refuses a program that the graph would refuse
+    every = build_axes(program, axes)  # refuses the programs that the graph refuses
     sequence = every[0]
     write_text(out, text)
     console.say(f'{out}: a program of {sequence.duration:.4g} s at {sequence.sample_rate:g} Hz')
