@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Suggestions after a result: a reason and a command line each, the most useful first."""
+"""Suggest the next steps after a result: a reason and a command each, the most useful first."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from piezo_ident.report.html import Step
 from piezo_ident.report.table import listed, number
 from scipy.signal import correlate
 
-#: an error of so many times the sensor noise leaves little to find
+#: an error of at most this many times the sensor noise leaves little to find
 ENOUGH = 2.0
 #: the programs of the experiments
 PROGRAMS: dict[Kind, str] = {'sweeps': 'diagnosis', 'holds': 'holds'}
 #: name of a record that the lab still has to make
 OTHER = 'other.csv'
-#: a voltage is compared with a program by means over so long [s], which must correlate so well
+#: averaging time to compare a voltage with a program [s], and least correlation of their means
 COARSE, SAME = 0.01, 0.98
 
 
 @dataclass(frozen=True)
 class Prompt:
     """
-    How the files of a result are named at the prompt.
+    Names of the files of a result at the prompt.
 
     Attributes
     ----------
     model : str
-        File of the model that was found.
+        File of the new model.
     given : str
-        File of the model that was judged, of a diagnosis.
+        File of the diagnosed model.
     records : mapping of str to str
-        File of a record by its name; the name where it is absent.
+        File of each record by the name of the record; by default the name itself.
     reading : sequence of str
         Options with which the records were read.
     """
@@ -117,7 +117,7 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
             ),
         )
     if not is_validated:
-        reason = 'no motion but that of these records was tested'
+        reason = 'only the motion of these records was tested'
         yield _experiment(reason, 'validation', result.model, prompt)
     if is_validated and times <= ENOUGH:
         yield _use(f'the error is {number(times, 2)} times the sensor noise', prompt, prompt.model)
@@ -139,7 +139,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
     other = next(name for name in names if name not in files)
     experiment = None
     if result.verdict != 'none' or result.untestable:
-        # the motions of a record without labels cannot be told apart
+        # a record may lack labels, so its voltage tells which programs were played
         played = [k for k, name in PROGRAMS.items() if any(_plays(r, name) for r in records)]
         experiment = next_experiment(result, records, played)
     if experiment is not None:
@@ -166,11 +166,11 @@ def _plays(record: Record, name: str) -> bool:
 
 
 def _is_played(program: Program, piece: Piece) -> bool:
-    # programs that are scaled take as long
+    # scaling a program keeps its times
     rate = min(piece.sample_rate, 2000.0)
     built = scaled(program, program.limits, rate).build()
     wanted, v = _means(built.v, rate), _means(piece.v, piece.sample_rate)
-    # the ends, which may be cut off, are rest
+    # a program begins and ends at rest, which a record may lack
     wanted = wanted[wanted.size // 10 : -(wanted.size // 10)]
     if v.size < wanted.size:
         return False

@@ -46,8 +46,8 @@ CANDIDATES = 6
 BAR, BARS, LEAST_WEIGHT = '█', 40, 0.005
 FOOTER = (
     'Every error is of a free run, never of one-step prediction. Base model: Gu, Li, Zhu and Su, '
-    'IEEE/ASME Trans. Mechatronics 21(3), 2016, doi:10.1109/TMECH.2015.2465868. Beside this page: '
-    'model.yaml (the refined model), diagnosis.json and the pictures.'
+    'IEEE/ASME Trans. Mechatronics 21(3), 2016, doi:10.1109/TMECH.2015.2465868. The folder of '
+    'this page also holds model.yaml (the refined model), diagnosis.json and the pictures.'
 )
 
 
@@ -146,8 +146,8 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
     timed = [e.name for e in result.effects if find_effect(e.name).time_driven]
     if timed:
         note += (
-            f' {", ".join(timed)}: values of the longest record. Such an effect follows time; the '
-            'refined model carries its expected size in another record.'
+            f' {", ".join(timed)}: values of the longest record. An effect of time differs '
+            'between records; the refined model carries its expected size in another record.'
         )
     head = ('effect', 'parameter', 'unit', '', 'value')
     # lists are long, and the last column wraps
@@ -173,14 +173,14 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 def remains(result: Diagnosis) -> list[tuple[str, str]]:
-    """Return rows on the rest, the range of the errors, H, noise, and the detectable size."""
+    """Return rows on the remaining error, its validity, H, noise, and the detectable size."""
     left, smallest, floor = result.unexplained, result.smallest_detectable, result.noise_floor
     source = result.noise_source.removeprefix(UNKNOWN)
     rest = f': {left.description}' if left.description else ''
     noise = 'unknown' if floor is None else f'{number(floor)} % of stroke, rms of single samples'
     size = f'{number(left.rms_percent)} % of stroke'
     rows = [
-        # a share belongs to an effect
+        # a share is known only beside an effect
         ('unexplained', (_left(result, left) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
         *(('hysteresis', text) for text in law_told(result)),

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The report of a result: a folder with the page, the pictures, the numbers and the model."""
+"""Write the report of a result: a folder with the page, pictures, numbers and the model."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 PAGE, MODEL = 'report.html', 'model.yaml'
 #: the numbers, by which an earlier report is known
 NUMBERS: Mapping[type, str] = {Identification: 'identification.json', Diagnosis: 'diagnosis.json'}
-#: all pictures that a report may have; those of an earlier one are replaced or deleted
+#: all pictures that a report may have; a new report replaces or deletes all of them
 PICTURES: Mapping[type, tuple[str, ...]] = {
     Identification: (
         *('sines', 'loops', 'segments', 'delay', 'response', 'orders'),
@@ -64,26 +64,26 @@ def write_report(
     ----------
     result : Identification or Diagnosis, or EachAxis of them
     folder : path
-        Made when it does not exist.  The files of an earlier report there are replaced, all of
-        them or none; other files stay.
+        Made if it does not exist.  The files of an earlier report in it are replaced, all
+        together; other files stay.
     progress : callable, optional
-        Called with the name of the step and the share of it that is done; may raise `Cancelled`
-        as long as nothing is written.
+        Called with the name of the step and its share done; may raise `Cancelled` before the
+        writing.
     prompt : Prompt, optional
-        How the files are named in the commands that the page suggests.
+        Names of the files in the commands that the page suggests.
 
     Returns
     -------
     Path
         The page, ``report.html``; beside it the pictures, ``model.yaml`` (of a diagnosis the
-        refined model) and ``identification.json`` or ``diagnosis.json``.  Of several axes each
-        has a folder with its report, beside ``model.yaml`` of the stage; the page is that of the
-        first.
+        refined model) and ``identification.json`` or ``diagnosis.json``.  With several axes, each
+        axis has a folder with its report, beside ``model.yaml`` of the stage; the result is the
+        page of the first axis.
 
     Raises
     ------
     DataError
-        When the folder cannot be written, or holds such files that are of no earlier report.
+        When the folder cannot be written, or holds files of these names from another source.
 
     Examples
     --------
@@ -169,7 +169,7 @@ def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:
 
 def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     """
-    Refuse a folder in which `write_report` would replace a file that is of no earlier report.
+    Refuse a folder in which `write_report` would replace a file from another source.
 
     `kind` is the class of the result.
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Results as HTML: nothing is loaded from elsewhere, everything foreign is escaped."""
+"""Results as HTML: a page loads nothing from elsewhere, and all foreign text is escaped."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from piezo_ident.report.table import plain_text, Table
 if TYPE_CHECKING:
     import jinja2
 
-#: size on the screen of a pixel of a picture: the letters of both then have one size
+#: size of a pixel of a picture on the screen: letters of picture and page then have one size
 SHOWN = 0.72
-#: a narrow screen shows a picture no smaller than this share of its width, and scrolls
+#: smallest width of a picture on a narrow screen, as a share of its width; then the page scrolls
 LEAST = 0.65
 
 
@@ -38,12 +38,12 @@ class Shown:
 
     @property
     def width(self) -> int:
-        """Width on the screen; that in pixels stands at bytes 16 to 19 of every PNG."""
+        """Width on the screen; bytes 16 to 19 of a PNG hold its width in pixels."""
         return round(SHOWN * int.from_bytes(self.png[16:20], 'big'))
 
     @property
     def least_width(self) -> int:
-        """Least width on the screen at which its letters can be read."""
+        """Smallest width on the screen at which the letters can be read."""
         return round(LEAST * self.width)
 
 
@@ -58,7 +58,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Link:
-    """Another file, by its address relative to the page, and what it holds."""
+    """Link to another file: its address relative to the page, and a description."""
 
     href: str
     text: str
@@ -66,7 +66,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Step:
-    """Why to do something, and the command that does it."""
+    """A suggestion: its reason, and the command that follows it."""
 
     reason: str
     command: str
@@ -112,7 +112,7 @@ def page_text(page: Page, warnings: Iterable[str]) -> str:
 
 
 def named(pictures: Sequence[Shown], *names: str) -> list[Shown]:
-    """Return the pictures whose names begin with one of those given."""
+    """Return the pictures whose names begin with one of `names`."""
     return [picture for picture in pictures if picture.name.startswith(names)]
 
 
@@ -123,7 +123,7 @@ def pairs(items: Iterable[tuple[str, str]]) -> list[str]:
 
 @cache
 def _environment() -> jinja2.Environment:
-    # a tenth of a second, and most commands make no page
+    # the import takes a tenth of a second, and few commands make a page
     import jinja2
 
     return jinja2.Environment(

@@ -41,7 +41,8 @@ PAPER_GAIN = 0.6411
 FOOTER = (
     'Method: Gu, Li, Zhu and Su, IEEE/ASME Trans. Mechatronics 21(3), 2016, '
     'doi:10.1109/TMECH.2015.2465868. Every error is of a free run, never of one-step '
-    'prediction. Beside this page: model.yaml, identification.json and the pictures.'
+    'prediction. The folder of this page also holds model.yaml, identification.json and the '
+    'pictures.'
 )
 
 
@@ -49,7 +50,7 @@ def headline(result: Identification) -> str:
     """
     Tell the error of the model, and of its hysteresis alone, in one sentence.
 
-    Both errors are over the same samples, see `Identification.headline`.
+    The two errors are over the same samples, see `Identification.headline`.
     """
     errors = result.headline
     text = ABOUT[errors.data].format(records=', '.join(errors.records))
@@ -60,7 +61,7 @@ def headline(result: Identification) -> str:
 
 
 def facts(result: Identification) -> list[tuple[str, str]]:
-    """Return the few numbers that stand beside the headline."""
+    """Return the main numbers, for a place beside the headline."""
     model, delay, floor = result.model, result.delay, result.noise_floor
     # slow poles are removed after the search for the order
     na, nb = model.dynamics.a.size, model.dynamics.b.size
@@ -133,7 +134,7 @@ def error_table(result: Identification) -> Table:
 
 
 def _fit(row: ErrorRow) -> str:
-    # at rest only noise is left to explain, and a good model looks like a bad one
+    # at rest the displacement is only noise, and a good model looks like a bad one
     if row.segment.partition(':')[0] == 'idle' or not math.isfinite(row.fit):
         return '–'
     # adding zero turns a negative zero into a plain one
@@ -141,7 +142,7 @@ def _fit(row: ErrorRow) -> str:
 
 
 def sine_tables(rows: Sequence[SineError]) -> list[Table]:
-    """Return the steady-state errors in the layout of the paper's Table I, if there are any."""
+    """Return the steady-state errors in the layout of the paper's Table I; empty without sines."""
     errors = [
         ('model with dynamics', *(number(row.percent) for row in rows)),
         ('hysteresis alone', *(number(row.static_percent) for row in rows)),
@@ -288,7 +289,7 @@ def identification_page(
         for record in result.records
         for fault in record.faults
     ]
-    # a fault stands in its own table; a second time would hide the other warnings
+    # a table lists the faults; the same faults among the warnings would hide other warnings
     shown = {f'{record.name}: {fault}' for record in result.records for fault in record.faults}
     warnings = [text for text in result.warnings if text not in shown]
     count = sum(not fault.is_note for record in result.records for fault in record.faults)

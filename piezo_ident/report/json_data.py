@@ -56,9 +56,9 @@ def to_json(
     Returns
     -------
     dict
-        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  An unknown or infinite
-        number is None.  Two numbers differ: an infinite parameter of an effect is the text ``inf``
-        or ``-inf``, and the overall error of a diverged model is the largest float64.
+        Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  Unknown and infinite
+        numbers are None, with two exceptions.  An infinite parameter of an effect is the text
+        ``inf`` or ``-inf``.  The overall error of a diverged model is the largest float64.
     """
     if isinstance(result, EachAxis):
         return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
@@ -342,7 +342,7 @@ def _parameter(parameter: FoundParameter) -> dict[str, Any]:
 
 
 def _value(value: Any) -> Any:
-    # a range without an end has an infinite end, while None means unknown
+    # an open range has an infinite end, and None would mean unknown
     if isinstance(value, list):
         return [_value(x) for x in value]
     if isinstance(value, float) and math.isinf(value):

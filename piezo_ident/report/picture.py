@@ -56,7 +56,7 @@ def plot(result: Result) -> Figure:
     NothingToDraw
         When the result holds no data.
     """
-    # imported by and by: the modules of a diagnosis take half a second
+    # each import comes late, because the modules of a diagnosis take half a second
     from piezo_ident.control.inverse import Inverse
     from piezo_ident.report.figures.free_run import loops_figure, overview_figure, record_figure
 
@@ -88,13 +88,13 @@ def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> N
     ----------
     result : Identification, Diagnosis, FreeRun or Inverse
     path : path
-        Ending in .png, .pdf or .svg; an old file is replaced.  Of several axes each has a file,
-        with its name at the end.
+        Ending in .png, .pdf or .svg; an old file is replaced.  With several axes, each axis has
+        its own file, with the name of the axis at the end.
 
     Raises
     ------
     ConfigError
-        When the ending is another one.
+        When the path has another ending.
     DataError
         When the file cannot be written.
     """

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The refined model of a diagnosis against the given one: errors elsewhere, and its H."""
+"""Compare the refined model of a diagnosis with the given model: errors on new records, and H."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def validated(
 
 
 def _judged(result: Diagnosis, parts: Iterable[tuple[Record, FreeRun | None]]) -> Diagnosis:
-    """Add the errors on records; a run of shared modes replaces that of the refined model."""
+    """Add the errors on records; a run of shared modes replaces the run of the refined model."""
     return replace(result, unseen=(*result.unseen, *(_unseen(result, *x) for x in parts)))
 
 
@@ -60,7 +60,7 @@ def _unseen(result: Diagnosis, record: Record, refined: FreeRun | None) -> Unsee
 
 
 def law_told(result: Diagnosis) -> list[str]:
-    """Return whether H is a sum of plays, and what each law leaves on kinds held out."""
+    """Describe the law of H, and the error of each law on held-out kinds of motion."""
     errors = result.errors_of_laws
     if not errors:
         return []
@@ -72,7 +72,7 @@ def law_told(result: Diagnosis) -> list[str]:
     elif result.law not in LAW_WORDS:
         about = 'a sum of plays'
     else:
-        # with an effect beside it, the wider law need not be that of H
+        # if effects were added, the refined model may keep another law for H
         kind = 'fitted with' if result.effects else 'not a sum of plays: H has'
         about = f'{kind} {LAW_WORDS[result.law]} ({result.law})'
     return [

@@ -12,13 +12,13 @@ import textwrap
 
 from piezo_ident.common.errors import printable
 
-#: of a terminal [characters]
+#: width of a terminal [characters]
 WIDTH = 99
 #: columns of a table of faults in the data
 FAULTS = ('fault', 'count', 'where', 'action')
 #: longer cells are wrapped on a page [characters]
 PROSE = 28
-#: names on a line, at most
+#: most names on a line
 LISTED = 8
 
 
@@ -27,7 +27,7 @@ class Table:
     """
     A table of text cells.
 
-    A `head` of empty cells is not shown; the `note` stands below on a page: units and formulas.
+    A `head` of empty cells is not shown.  The `note` on units and formulas follows on a page.
     """
 
     title: str
@@ -72,7 +72,7 @@ class Table:
 def table(
     title: str, head: tuple[str, ...], rows: Sequence[tuple[str, ...]], note: str = ''
 ) -> list[Table]:
-    """Return a table, or nothing without rows."""
+    """Return a list with the table; empty if `rows` is empty."""
     return [Table(title, head, rows, note)] if rows else []
 
 
@@ -99,7 +99,7 @@ def plain_text(parts: Iterable[Table | str]) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return a number to so many significant digits, a dash where there is none."""
+    """Format a number with significant digits; a dash stands for an unknown number."""
     if value is None or math.isnan(value):
         return '–'
     if math.isinf(value):
@@ -112,7 +112,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def length(metres: float) -> str:
-    """Return a length in the unit in which it reads best."""
+    """Format a length in mm, µm or nm."""
     for limit, factor, unit in ((1e-3, 1e3, 'mm'), (1e-6, 1e6, 'µm')):
         if abs(metres) >= limit:
             return f'{number(metres * factor, 4)} {unit}'
@@ -120,14 +120,14 @@ def length(metres: float) -> str:
 
 
 def share_text(share: float) -> str:
-    """Return a share as a percentage within 0 .. 100, a dash where there is none."""
+    """Format a share as a percentage within 0 .. 100; a dash stands for an unknown share."""
     return f'{100.0 * min(1.0, max(0.0, share)):.0f} %' if math.isfinite(share) else '–'
 
 
 def origin_tables(
     settings: Mapping[str, object], unset: str, versions: Mapping[str, object]
 ) -> list[Table]:
-    """Return the settings and versions of a result; a setting that is None reads `unset`."""
+    """Return the settings and versions of a result; `unset` stands for a setting of None."""
 
     def text(value: object) -> str:
         if isinstance(value, tuple):
