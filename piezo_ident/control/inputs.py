@@ -34,6 +34,15 @@ def checked_motion(wanted: ArrayLike) -> Array:
     return y
 
 
+def check_rate(rate: float, sample_rate: float | None) -> None:
+    """Refuse a sampling rate [Hz] of a motion other than the rate of the model, by a DataError."""
+    if sample_rate is not None and not np.isclose(sample_rate, rate, rtol=1e-6):
+        raise DataError(
+            f'the wanted motion is sampled at {sample_rate:g} Hz, the model at {rate:g} Hz; give '
+            'the motion at that rate'
+        )
+
+
 def _vector(values: ArrayLike) -> Array:
     """Convert numbers to a vector, with NaN for a masked number; empty for other values."""
     try:

@@ -29,6 +29,7 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.control.expectation import expect
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
 from piezo_ident.control.inputs import (
+    check_rate,
     checked_limits,
     checked_motion,
     extrapolated,
@@ -171,11 +172,7 @@ def invert(
         When the model has no inverse.
     """
     y = checked_motion(wanted)
-    if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
-        raise DataError(
-            f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
-            f'{model.sample_rate:g} Hz; give the motion at that rate'
-        )
+    check_rate(model.sample_rate, sample_rate)
     s, (low, high, slew) = model.scaling, checked_limits(model, limits, slew)
     task, warnings_of_h = _task(model, y, (low, high, slew), clip, channels or {})
     if like is not None and isinstance(task.H, RateInverse):

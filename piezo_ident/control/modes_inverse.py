@@ -31,7 +31,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.axes_inverse import AxesFilter, inverse_filters, static_gain
 from piezo_ident.control.expectation import expect
-from piezo_ident.control.inputs import checked_limits, extrapolated, tolerance
+from piezo_ident.control.inputs import check_rate, checked_limits, extrapolated, tolerance
 from piezo_ident.control.inverse import Inverse, LARGE, MATTERS, RESTS, STANDS, STILL
 from piezo_ident.control.linear_inverse import least_gain
 from piezo_ident.effects.slew_limit import SlewLimit
@@ -103,11 +103,7 @@ def invert_modes(
     ModelError
         When the modes lack an inverse, or the iteration does not contract.
     """
-    if sample_rate is not None and not np.isclose(sample_rate, model.sample_rate, rtol=1e-6):
-        raise DataError(
-            f'the wanted motion is sampled at {sample_rate:g} Hz, the model at '
-            f'{model.sample_rate:g} Hz; give the motion at that rate'
-        )
+    check_rate(model.sample_rate, sample_rate)
     task = _Task(model, modes, wanted, limits, slew, clip)
     best = _iterated(task)
     return _results(task, best, clip)

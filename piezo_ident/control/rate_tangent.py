@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel, ordered_kernel
-from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.effects.rate_dependent_hysteresis import AMPLITUDES, RateDependentHysteresis
 from piezo_ident.operators.kernels import curve_slope
 from scipy.sparse.linalg import LinearOperator
 
@@ -28,8 +28,7 @@ def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOpera
     h = effect.hysteresis
     r, q, p1, p2, p0, low, c = h.for_kernel
     power, slope = effect.power_and_slope(np.ascontiguousarray(u), u0)
-    names = 'gain', 'stretch', 'lead', 'lead_stretch'
-    growth = np.array([effect.number(name) for name in names])
+    growth = np.array([effect.number(name) for name in AMPLITUDES])
     rest = h.initial_memory(u0)
     memory = np.append(rest, np.zeros(r.size - rest.size))
     edge = np.empty((u.size, r.size), dtype=np.int8)
