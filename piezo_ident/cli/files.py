@@ -35,7 +35,6 @@ NOTES = 20_000
 #: suffixes of the files that are searched in a folder
 RECORD_FILES = (*(x for x in READERS if x not in UNCERTAIN), *BAG_FILES)
 TABLE_FILES = ('.csv', '.npz')
-PICTURES = ('.png', '.pdf', '.svg')
 
 
 def expand(paths: Sequence[Path], console: Console) -> list[Path]:

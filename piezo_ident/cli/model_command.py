@@ -19,7 +19,6 @@ from piezo_ident.cli.files import (
     check_order,
     check_output,
     data_of,
-    PICTURES,
     print_faults,
     read_all,
     TABLE_FILES,
@@ -37,6 +36,7 @@ from piezo_ident.record.io import write_columns
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.record.tables.write import blocks_of
 from piezo_ident.report import save_plot, to_json
+from piezo_ident.report.picture import ENDINGS
 from piezo_ident.uncertainty.prediction import unknown_parts
 from piezo_ident.verbs.predict import bands, free_run, predict, prediction_doubts
 
@@ -51,7 +51,7 @@ def _checked(args: SimpleNamespace, what: str) -> StageModel | MultiAxisModel:
     """Load the model; refuse outputs that cannot be written, and files in the wrong order."""
     for path, suffixes, content in (
         (args.out, TABLE_FILES, what),
-        (args.plot, PICTURES, 'a picture'),
+        (args.plot, ENDINGS, 'a picture'),
     ):
         if path is not None:
             inputs = args.model, args.record

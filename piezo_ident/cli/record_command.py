@@ -111,7 +111,7 @@ def _record_of(
 
 def _write_record(args: SimpleNamespace, record: Record, data: dict[str, str]) -> tuple[str, ...]:
     """Write a record, or its voltages alone; return the data that the file cannot keep."""
-    is_bag = args.out.suffix.lower() in ('', '.mcap', '.db3')
+    is_bag = args.out.suffix.lower() in ('', *BAG_FILES)
     with deferred_interrupts():
         if not args.voltage_only:
             return record_io.write(

@@ -27,28 +27,16 @@ from piezo_ident.identification.errors import (
     validation_errors,
 )
 from piezo_ident.identification.free_run_fit import fit_free_run
-from piezo_ident.identification.prepare import (
-    fault_lines,
-    filled_in,
-    prepare,
-    Run,
-)
+from piezo_ident.identification.prepare import fault_lines, filled_in, prepare, Run
 from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import FitOutcome, Identification, Steps
 from piezo_ident.identification.settings import Progress, Settings, silent
 from piezo_ident.identification.solvers.least_squares import singular_is_ours
 from piezo_ident.identification.starts import with_starts
 from piezo_ident.identification.step1_delay import first_step
-from piezo_ident.identification.step2_dynamics import (
-    second_step,
-)
-from piezo_ident.identification.three_steps import (
-    fit_three_steps,
-)
-from piezo_ident.identification.warnings import (
-    warn_of_shape,
-    warnings_of,
-)
+from piezo_ident.identification.step2_dynamics import second_step
+from piezo_ident.identification.three_steps import fit_three_steps
+from piezo_ident.identification.warnings import warn_of_shape, warnings_of
 from piezo_ident.model.metrics import FORMULA, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay

@@ -31,10 +31,7 @@ from piezo_ident.identification.solvers.arx import (
     scan_orders,
     stabilised,
 )
-from piezo_ident.identification.solvers.output_error import (
-    output_error,
-    simulation_error,
-)
+from piezo_ident.identification.solvers.output_error import output_error, simulation_error
 from piezo_ident.identification.spectra import (
     frequency_response,
     FrequencyResponse,

@@ -107,7 +107,7 @@ def choose_thresholds(
     with the share of the work done, and may raise to stop it.
     """
     best = even_thresholds(swing, COUNTS[0])
-    best_loss, places = _held_loss(fit, held, best, dynamics, delay)
+    best_loss, _ = _held_loss(fit, held, best, dynamics, delay)
     misses = 0
     for i, count in enumerate(COUNTS[1:]):
         tick(i / len(COUNTS))
