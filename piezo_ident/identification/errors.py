@@ -152,9 +152,7 @@ def with_fine_plays(model: StageModel, excerpts: Sequence[Excerpt]) -> StageMode
     return replace(model, hysteresis=fit_hysteresis(R, r).hysteresis)
 
 
-def fast_error(
-    model: StageModel, law: str, runs: Sequence[Run], memories: Memories | None = None
-) -> tuple[float, float]:
+def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float, float]:
     """
     Compute the error on fast motion with a fine H, and the fast motion itself.
 

@@ -130,8 +130,7 @@ def _identify(
     )
     warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
     result = replace(result, warnings=warnings)
-    known = fit.memories if data.labelled else None
-    fast = fast_error(judged, fit.hysteresis.law, runs, known)
+    fast = fast_error(judged, fit.hysteresis.law, runs)
     provenance = _provenance(result, records, fast)
     judged_runs = (
         JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)

@@ -181,7 +181,7 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
     size = f'{number(left.rms_percent)} % of stroke'
     rows = [
         # a share is known only beside an effect
-        ('unexplained', (_left(result, left) if result.effects else size) + rest),
+        ('unexplained', (_left(left) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
         *(('hysteresis', text) for text in law_told(result)),
         ('noise floor', f'{noise} ({source})'),
@@ -199,17 +199,14 @@ def _stands_for(result: Diagnosis) -> str:
     return f'for motion of these kinds, each predicted from the others: {kinds}'
 
 
-def _left(result: Diagnosis, part: FoundEffect | Unexplained) -> str:
+def _left(part: FoundEffect | Unexplained) -> str:
     return (
         f'{share_text(part.share)} of the explainable part, {number(part.rms_percent)} % of stroke'
     )
 
 
 def _added(result: Diagnosis) -> list[str]:
-    return [
-        f'added: {effect.name} (slot: {effect.slot}), {_left(result, effect)}'
-        for effect in result.effects
-    ]
+    return [f'added: {x.name} (slot: {x.slot}), {_left(x)}' for x in result.effects]
 
 
 def _alike(result: Diagnosis) -> list[str]:
