@@ -101,6 +101,7 @@ def _by_least_squares(
     orders: Sequence[tuple[int, int]],
     delays: Sequence[int],
 ) -> list[tuple[tuple[int, int], int, Dynamics]]:
+    """Fit a stable G at each order and its `NEAR` best delays, by least squares (ARX)."""
     parts = [
         (w[a:b], x[a:b])
         for (w, x), s in zip(pairs, stretches, strict=True)

@@ -276,8 +276,8 @@ def _correlation(piece: Piece) -> float:
     """
     Correlate averages of voltage and displacement, over the averaging time that correlates most.
 
-    Above a resonance a stage moves against its voltage, so fast motion does not tell the sign.  n
-    averages correlate by chance by 1 / sqrt(n), which is subtracted.
+    Above a resonance a stage moves against its voltage, so fast motion does not tell the sign.
+    The correlation of n averages by chance, 1 / sqrt(n), is subtracted.
     """
     best = 0.0
     size = 1

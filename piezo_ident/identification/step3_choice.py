@@ -246,6 +246,7 @@ def choose_law(
 
 
 def _upper(difference: Array) -> float:
+    """Compute the mean plus one standard error."""
     return float(difference.mean() + difference.std(ddof=1) / np.sqrt(difference.size))
 
 

@@ -151,8 +151,9 @@ class OrderTable:
     """
     Table of all orders; arrays have shape (na_max, nb_max) with entry [na-1, nb-1].
 
-    It holds the one-step loss on the fitted samples, the criteria of Akaike and of Schwarz, and
-    the free-run rms error on the held-out samples, infinite for an unstable model.
+    `loss` is the one-step loss on the fitted samples; `aic` and `bic` are the criteria of Akaike
+    and of Schwarz.  `held_out` is the free-run rms error on the held-out samples, infinite for an
+    unstable model.
     """
 
     loss: Array

@@ -19,7 +19,7 @@ ROWS = 1024
 
 @contextmanager
 def singular_is_ours() -> Iterator[None]:
-    """Replace the error of numpy for a singular fit by an error that says what the data lack."""
+    """Replace the error of numpy for a singular fit by an error that asks for better data."""
     try:
         yield
     except np.linalg.LinAlgError as error:

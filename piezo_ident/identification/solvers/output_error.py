@@ -77,8 +77,9 @@ def lag_products(x: Array, z: Array, x_at: int, z_at: int, n: int, n_x: int, n_z
 
         S(i+1, j+1) = S(i, j) + x(s-1-i) z(s-1-j) - x(e-1-i) z(e-1-j)
 
-    `x_at` and `z_at` are the index of the first of the n samples s .. e-1 in each signal, behind
-    at least as many samples as lags.  The sums have shape (n_x, n_z), the numbers of lags.
+    `x_at` and `z_at` are the places of the first of the n samples s .. e-1 in each signal.  At
+    least as many samples as lags come before them.  The sums have shape (n_x, n_z), the numbers
+    of lags.
 
     Examples
     --------
@@ -115,8 +116,8 @@ def _mean(x: Array, stretches: Stretches) -> float:
 
 
 def _past(x: Array, stretches: Stretches, count: int, negative: bool = False) -> Array:
-    # the stage counts as at rest before the record.  The level does not change the result, because
-    # the offsets are eliminated; without the level the sums lose no digits
+    # the stage counts as at rest before the record.  Signals without their level keep more digits
+    # in the sums; the offsets are eliminated, so the level has no effect on the result
     level = _mean(x, stretches)
     past = np.empty(count + x.size)
     if negative:

@@ -8,9 +8,9 @@ Minimise a bounded least-squares problem, reduced to its Gram matrix, by a parti
 
 Kennedy and Eberhart (1995), doi:10.1109/ICNN.1995.488968, with the constriction of Clerc and
 Kennedy (2002), doi:10.1109/4235.985692.  The particles sit on a ring, and each follows the best of
-its six nearest neighbours.  If all followed the best of the swarm, the swarm collapsed onto a wall
-of the box before it reached the optimum of an ill-conditioned least-squares problem (3 of 20 seeds
-came within 1 % of it; on the ring 20 of 20 did).
+its six nearest neighbours.  On an ill-conditioned least-squares problem, 20 of 20 seeds came
+within 1 % of the optimum.  With all particles following the best of the swarm, 3 of 20 seeds did,
+because the swarm collapsed onto a wall of the box.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ATTRACTION = 1.49618
 REACH = 3
 #: share of its speed that a particle keeps when a wall of the box reflects it
 BOUNCE = 0.5
-#: iterations between two callbacks, and those over which the best value must fall
+#: iterations between two callbacks, and iterations over which the best value must fall
 STRETCH, PATIENCE = 100, 1000
 
 
