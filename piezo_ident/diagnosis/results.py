@@ -15,7 +15,7 @@ from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Piece
-from piezo_ident.selection.judged import Promise
+from piezo_ident.selection.judged import JudgedRun, Promise
 
 FORMULA = (
     '100 rms(y - y_hat) / (max y - min y), free run, the zero of each record free; before: the '
@@ -307,6 +307,14 @@ class Diagnosis(Showable):
     def stroke(self) -> float:
         """Largest stroke of the records [m]."""
         return max(float(np.ptp(r.piece.y[r.sound])) for r in self.residuals if r.sound.any())
+
+    @property
+    def runs(self) -> list[JudgedRun]:
+        """Free runs of the refined model, as fitted."""
+        return [
+            JudgedRun(r.record, r.piece, r.piece.y - r.after, r.sound, np.zeros_like(r.sound))
+            for r in self.residuals
+        ]
 
     @property
     def changes(self) -> tuple[str, ...]:

@@ -21,8 +21,9 @@ test, a law with more signals may fit a hysteresis of the voltages better than p
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+import hashlib
 from typing import NamedTuple
 import warnings
 
@@ -41,6 +42,7 @@ from piezo_ident.fitting.modes.periods import (
     periods_of,
 )
 from piezo_ident.fitting.modes.signals import with_input_plays, with_loop_plays, with_softening
+from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.settings import Progress
 from piezo_ident.model.axis_records import axes_of, voltage_of
 from piezo_ident.model.modes.shared_modes import SharedModes
@@ -49,11 +51,15 @@ from piezo_ident.record.channels import Axes
 from piezo_ident.record.record import Record
 
 NAME = 'loop_hysteresis'
+#: what is left of the error
+LEFT = 'structure that the shared modes do not account for'
 #: laws, simplest first; those of `IN_FRONT` leave the modes where they are
 LAWS = ('linear', 'plays in front', 'plays', 'softening', 'softening and plays')
 IN_FRONT = LAWS[:2]
 #: a law is preferred to simpler ones if it takes this share of their error (taste)
 WORTH = 0.1
+#: standard deviation of a normal variable in medians of its size
+NORMAL = 1.4826
 #: laws grow on so many records of a group, those of the largest weight (taste: time)
 FEW = 2
 #: largest correlation of two voltages: their paths are then known ten times worse than their sum
@@ -64,63 +70,140 @@ ORDERS = (4, 6, 8, 12, 16, 20, 28, 36, 44, 52)
 STEPS, LAST_STEPS = 10, 6
 
 
+class Multisines(NamedTuple):
+    """
+    Periods of multisines of all axes at once, at two amplitudes, of two realisations each.
+
+    Attributes
+    ----------
+    periods : tuple of PeriodicRecord
+        Smallest amplitude first; their voltages are about `v0`.
+    v0 : ndarray, shape (axes,)
+        [V]
+    """
+
+    periods: tuple[PeriodicRecord, ...]
+    v0: Array
+
+    @classmethod
+    def of(cls, axes: Collection[str], records: Sequence[Record]) -> Multisines | None:
+        """Find the multisines of axes in records that can carry shared modes; else None."""
+        rates = [piece.sample_rate for record in records for piece in record]
+        of_one_rate = same_rate(min(rates), max(rates))
+        if not of_one_rate or axes_of(records) != tuple(sorted(axes)):
+            return None
+        try:
+            periods, v0 = periods_of(records)
+        except (DataError, IdentificationError):
+            return None
+        parts = groups(periods).values()
+        if len(parts) < 2 or min(map(len, parts)) < 2 or len(v0) != len(axes):
+            return None
+        return None if max(map(likeness, parts)) > ONE_SIGNAL else cls(periods, v0)
+
+    @property
+    def digest(self) -> str:
+        """Fingerprint of voltages and displacements."""
+        arrays = (np.ascontiguousarray(x) for r in self.periods for x in (r.u, r.y))
+        return hashlib.sha256(b''.join(x.tobytes() for x in arrays)).hexdigest()[:16]
+
+
 class SharedModesFinding(NamedTuple):
     """
-    Modes with hysteresis inside their loop, fitted to all multisines, and their law.
+    Modes with hysteresis inside their loop, and their law.
 
     `errors` are those of each law and of ``chains`` on the multisines held out, % of rms(y).
     `held_out` has the mean squared error of the law on them [m^2], in alphabetical order of the
-    axes, by the label of each segment of the same amplitude.
+    axes, by the label of each segment of the same amplitude.  `fitted` has the labels of the
+    segments that the modes were fitted to.
     """
 
     modes: SharedModes
     law: str
     errors: Mapping[str, float]
     held_out: Mapping[str, Array]
+    fitted: frozenset[str]
 
 
 def find_shared_modes(
-    chains: MultiAxisModel, records: Sequence[Record], progress: Progress
+    chains: MultiAxisModel,
+    sines: Multisines,
+    records: Sequence[Record],
+    progress: Progress,
+    *,
+    tests: bool = False,
 ) -> SharedModesFinding | None:
     """
     Find hysteresis inside the loop of shared modes, if chains err more without it.
 
-    The records must hold multisines of all axes at once, at two amplitudes, of two realisations
-    each.  The result is None for other records, and for a stage free of such hysteresis.
+    Parameters
+    ----------
+    chains : MultiAxisModel
+    sines : Multisines
+        Of the records.
+    records : sequence of Record
+    progress : callable
+    tests : bool
+        Whether the multisines held out stay out of the last fit, to test its modes.
+
+    Returns
+    -------
+    SharedModesFinding or None
+        None for a stage free of such hysteresis.
     """
-    if axes_of(records) != tuple(sorted(chains.axes)):
-        return None
     try:
-        every, v0 = periods_of(records)
-        parts = groups(every).values()
-        if len(parts) < 2 or min(map(len, parts)) < 2 or len(v0) != len(chains.axes):
-            return None
-        alike = max(map(likeness, parts)) > ONE_SIGNAL
-        found = None if alike else _found(chains, every, v0, progress)
-    except (DataError, IdentificationError):
-        # the lines leave the axes or the order of the model open
+        found = _found(chains, sines, progress, tests)
+        return found and found._replace(modes=_placed(found.modes, records))
+    except (DataError, IdentificationError, ModelError):
+        # the lines leave the order of the model open, or the modes run away on other motion
         return None
-    return found and found._replace(modes=_placed(found.modes, records))
 
 
 def _found(
-    chains: MultiAxisModel, every: Sequence[PeriodicRecord], v0: Array, progress: Progress
+    chains: MultiAxisModel, sines: Multisines, progress: Progress, tests: bool
 ) -> SharedModesFinding | None:
+    every, v0 = sines
+    taught, held_out = held_apart(every)
+    errors = {'chains': percent_of(held_out, _steady(chains, held_out, v0))}
+    # no law errs by less than the noise
+    can_win = _beats(_noise(held_out), errors['chains'])
+    if errors['chains'] < _smallest(chains, every) or not can_win:
+        return None
     search = LawSearch(every, progress)
-    errors = {'chains': percent_of(search.held_out, _steady(chains, search.held_out, v0))}
-    if errors['chains'] < _smallest(chains, every) or not search.modes_move():
+    if not search.modes_move():
         return None
     fitted = search.laws()
     errors |= {law: search.error(dict.fromkeys(search.groups, x)) for law, x in fitted.items()}
     limit = min(errors[law] for law in LAWS) / (1 - WORTH)
     law = next(law for law in LAWS if errors[law] <= limit)
-    if law in IN_FRONT or errors[law] ** 2 > TAKES * errors['chains'] ** 2:
+    if law in IN_FRONT or not _beats(errors[law], errors['chains']):
         return None
-    modes = loop_fit(fitted[law], every, iterations=LAST_STEPS)
+    last = [record for part in taught for record in part] if tests else every
+    modes = loop_fit(fitted[law], last, iterations=LAST_STEPS)
     progress('shared modes', 1.0)
-    missed = search.missed(fitted[law])
-    held_out = {record.name: missed[record.group] for record in every}
-    return SharedModesFinding(replace(modes, v0=v0), law, errors, held_out)
+    judged = modes if tests else fitted[law]
+    errors[law] = search.error(dict.fromkeys(search.groups, judged))
+    missed = search.missed(judged)
+    return SharedModesFinding(
+        replace(modes, v0=v0),
+        law,
+        errors,
+        {record.name: missed[record.group] for record in every},
+        frozenset(record.name for record in last),
+    )
+
+
+def _beats(error: float, chains: float) -> bool:
+    """Tell whether an error is so small that chains are given up."""
+    return error**2 <= TAKES * chains**2
+
+
+def _noise(records: Sequence[PeriodicRecord]) -> float:
+    """Compute the noise in one period, in % of rms(y); the end of a settling does not count."""
+    of_each = [NORMAL * np.median(np.abs(r.noise), axis=0) for r in records]
+    power = [np.mean(r.y[-1] ** 2, axis=0) for r in records]
+    shares = [np.sum(n**2) / np.sum(p) for n, p in zip(of_each, power, strict=True)]
+    return 100 * float(np.sqrt(np.mean(shares)))
 
 
 def _steady(chains: MultiAxisModel, records: Sequence[PeriodicRecord], v0: Array) -> list[Array]:
@@ -149,6 +232,15 @@ def _placed(modes: SharedModes, records: Sequence[Record]) -> SharedModes:
     return replace(modes, y0=modes.y0 + np.nanmean(left, axis=0))
 
 
+def held_apart(
+    records: Sequence[PeriodicRecord],
+) -> tuple[list[list[PeriodicRecord]], list[PeriodicRecord]]:
+    """Hold out one record of each group; return the others of each group, and those held out."""
+    # a record that does not repeat judges nothing
+    parts = [sorted(part, key=lambda record: record.weight) for part in groups(records).values()]
+    return [part[:-1] for part in parts], [part[-1] for part in parts]
+
+
 class LawSearch:
     """
     Fits of the laws to periodic records; one record of each group is held out.
@@ -162,13 +254,8 @@ class LawSearch:
 
     def __init__(self, records: Sequence[PeriodicRecord], progress: Progress) -> None:
         self._progress = progress
-        taught, self.held_out, self._few = list[list[PeriodicRecord]](), [], []
-        for part in groups(records).values():
-            # a record that does not repeat judges nothing
-            *others, out = sorted(part, key=lambda record: record.weight)
-            self.held_out.append(out)
-            taught.append(others)
-            self._few += others[-FEW:]
+        taught, self.held_out = held_apart(records)
+        self._few = [record for part in taught for record in part[-FEW:]]
         self.groups = [record.group for record in self.held_out]
         middle = len(taught) // 2
         self._middle = taught[middle][-FEW:]
@@ -256,7 +343,7 @@ def with_shared_modes(
         group=None,
         gain=None,
         set_in=False,
-        unexplained=Unexplained(left, after, 'structure that the shared modes do not account for'),
+        unexplained=Unexplained(left, after, LEFT),
         after=Errors(after, {}, {}),
         held_out=None,
         residuals=tuple(residuals),

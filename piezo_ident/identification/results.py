@@ -16,6 +16,7 @@ from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult
 from piezo_ident.identification.step2_dynamics import DynamicsResult
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
+from piezo_ident.model.free_run import piece_runs, PieceRun
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
@@ -124,10 +125,42 @@ def rms_percent(rows: Sequence[ErrorRow], static: bool = False) -> float:
     return float(np.sqrt(squares / n)) if n else float('nan')
 
 
+@dataclass(frozen=True, eq=False)
+class SharedRuns:
+    """
+    Free runs of modes that several axes share, which predict an axis instead of its chain.
+
+    Attributes
+    ----------
+    law : str
+        Law of the hysteresis inside their loop.
+    errors : mapping of str to float
+        Errors of each law and of the chains on multisines held out, % of rms(y) of all axes.
+    runs : tuple of PieceRun
+        The modes have no hysteresis of their own: its displacement is that of the whole model.
+    """
+
+    law: str
+    errors: Mapping[str, float]
+    runs: tuple[PieceRun, ...]
+
+    @property
+    def told(self) -> str:
+        """The choice in words."""
+        errors = ', '.join(f'{law} {error:.3g} %' for law, error in self.errors.items())
+        return (
+            f'the axes share modes with hysteresis inside their loop ({self.law}), which predict '
+            f'instead of chains; on multisines held out of the fit, in % of rms(y): {errors}'
+        )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Showable):
     """
     Result of an identification.
+
+    If axes share modes, errors, warnings and promise are those of the modes.  Delay, dynamics and
+    hysteresis are those of the chain of the axis.
 
     Attributes
     ----------
@@ -142,6 +175,8 @@ class Identification(Showable):
     memories : mapping of (str, float) to ndarray or Start
         Fitted play outputs at the start of a piece, and the creep left from earlier motion; keys
         are record name and start time.
+    shared : SharedRuns or None
+        Prediction by modes that the axes share.
 
     Examples
     --------
@@ -168,6 +203,14 @@ class Identification(Showable):
     records: tuple[Record, ...] = ()
     memories: Memories = field(default_factory=dict)
     promise: Promise | None = None
+    shared: SharedRuns | None = None
+
+    @property
+    def runs(self) -> Sequence[PieceRun]:
+        """Free runs of the model over the pieces of the records."""
+        if self.shared is not None:
+            return self.shared.runs
+        return piece_runs(self.model, self.records, self.memories)
 
     @property
     def parameters(self) -> tuple[ModelParameter, ...]:

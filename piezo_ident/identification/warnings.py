@@ -57,7 +57,7 @@ def warnings_of(
     wrong = misspelt([label for record in records for label in record.labels])
     if wrong:
         warnings.append(f'segment labels that mean nothing here: {", ".join(wrong)}')
-    return [*warnings, *_of_axes(pieces), *_of_errors(result, pieces)]
+    return [*warnings, *_of_axes(pieces), *warn_of_errors(result, pieces)]
 
 
 def _of_axes(pieces: Sequence[Piece]) -> list[str]:
@@ -152,7 +152,8 @@ def _of_band(dynamics: DynamicsResult, model: StageModel) -> list[str]:
     ]
 
 
-def _of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
+def warn_of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]:
+    """Warn if the errors say that the model explains little, or lacks an effect."""
     warnings = []
     chosen, held = result.error('selection'), result.error('held out')
     error = held if np.isfinite(held) else chosen

@@ -80,14 +80,14 @@ def next_steps(
         Names of the files.
     """
     if isinstance(result, EachAxis):
-        return [_after_axes(isinstance(next(iter(result.values())), Diagnosis), prompt)]
+        return [_after_axes(result, prompt)]
     if isinstance(result, Diagnosis):
         return list(_after_diagnosis(result, prompt))
     return list(_after_identification(result, prompt))
 
 
-def _after_axes(is_diagnosed: bool, prompt: Prompt) -> Step:
-    if is_diagnosed:
+def _after_axes(result: EachAxis[Identification] | EachAxis[Diagnosis], prompt: Prompt) -> Step:
+    if result.modes is not None or isinstance(next(iter(result.values())), Diagnosis):
         return Step(
             'check the model on a record that took no part',
             prompt.command('predict', prompt.model, OTHER),

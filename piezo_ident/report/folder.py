@@ -19,7 +19,6 @@ from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
 from piezo_ident.identification.settings import Progress, silent
 from piezo_ident.model.files import model_to_yaml
-from piezo_ident.model.free_run import piece_runs
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.model.sines import sines_of
 from piezo_ident.report.advice import next_steps, Prompt
@@ -141,7 +140,7 @@ def _identified(
     # matplotlib takes half a second to import, and most commands draw nothing
     from piezo_ident.report.figures.identification import draw_identification
 
-    runs = piece_runs(result.model, result.records, result.memories)
+    runs = result.runs
     drawn = draw_identification(result, runs, lambda x: progress('drawing', 0.45 * x))
     shown = _rendered(drawn, progress)
     page = identification_page(result, sines_of(runs), shown, drawn.left_out)

@@ -83,6 +83,8 @@ def facts(result: Identification) -> list[tuple[str, str]]:
         'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
         'effects': ', '.join(effect.name for effect in model.effects),
     }
+    if result.shared is not None:
+        texts |= {'delay': '', 'dynamics': f'shared modes, {result.shared.law}', 'hysteresis': ''}
     missing = dict(result.not_identified)
     return [
         (what, 'not identified' if what in missing else text)
@@ -295,7 +297,7 @@ def identification_page(
     count = sum(not fault.is_note for record in result.records for fault in record.faults)
     if count:
         warnings.append(f'the data had {count} kinds of faults, see below')
-    origin = result.model.identification
+    origin, of = result.model.identification, ' of the chain' if result.shared else ''
     settings = {'method': origin.get('method', '–'), **asdict(result.settings)}
     versions = {'piezo_ident': __version__, **dict(origin.get('versions', {}))}
     return Page(
@@ -318,10 +320,10 @@ def identification_page(
                 brief=True,
             ),
             Section(
-                'Delay and dynamics',
+                f'Delay and dynamics{of}',
                 [*named(pictures, 'delay', 'response', 'orders'), *dynamics_tables(result)],
             ),
-            Section('Hysteresis', hysteresis_tables(result)),
+            Section(f'Hysteresis{of}', hysteresis_tables(result)),
             Section(
                 'Origin',
                 [

@@ -167,7 +167,7 @@ def steps_to_json(steps: Steps, sample_rate: float, records: Sequence[Record]) -
 def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, Any]:
     from piezo_ident.report.identification import headline
 
-    model, fit, dynamics = result.model, result.hysteresis, result.dynamics
+    model, fit, dynamics, shared = result.model, result.hysteresis, result.dynamics, result.shared
     h, m = model.hysteresis, model.hysteresis.thresholds.size
     std = fit.std if fit.std.size == m + 2 else np.full(m + 2, np.nan)
     records = [record.name for record in result.records]
@@ -185,6 +185,7 @@ def _identified(result: Identification, runs: Sequence[PieceRun]) -> dict[str, A
             'rows': [asdict(row) for row in result.errors],
         },
         'promise': _promise(result.promise),
+        'shared_modes': shared and {'law': shared.law, 'errors_of_laws': dict(shared.errors)},
         'quantities': [asdict(p) | {'known': p.is_known} for p in model.quantities],
         'sines': [asdict(row) for row in sines_of(runs)],
         'noise_floor': {'percent_of_stroke': result.noise_floor, 'source': result.noise_source},

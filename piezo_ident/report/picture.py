@@ -12,7 +12,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
-from piezo_ident.model.free_run import FreeRun, piece_runs, PieceRun
+from piezo_ident.model.free_run import FreeRun, PieceRun
 from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
 from piezo_ident.model.multi_axis import EachAxis
 from piezo_ident.record.record import Record
@@ -77,7 +77,7 @@ def plot(result: Result) -> Figure:
 
     if isinstance(result, Diagnosis):
         return residual_figure(worst_pieces(result, 1)[0])
-    return loops_figure(piece_runs(result.model, result.records, result.memories))
+    return loops_figure(result.runs)
 
 
 def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> None:

@@ -44,10 +44,11 @@ def _judged(result: Diagnosis, parts: Iterable[tuple[Record, FreeRun | None]]) -
 
 
 def _unseen(result: Diagnosis, record: Record, refined: FreeRun | None) -> Unseen:
-    given, model = result.given, result.model
-    runs = free_run(given, record), refined or free_run(model, record)
-    before, after = same_part_errors(*runs)
-    sines = zip(sine_errors(given, record), sine_errors(model, record), strict=True)
+    last = refined or free_run(result.model, record)
+    # without effects the shared modes were given
+    first = last if refined and not result.effects else free_run(result.given, record)
+    before, after = same_part_errors(first, last)
+    sines = zip(*(sine_errors(x, record) for x in (result.given, result.model)), strict=True)
     return Unseen(
         record=record.name,
         before=before.percent,

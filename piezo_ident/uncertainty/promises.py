@@ -17,7 +17,7 @@ come from.  The zero of the sensor does not count where it has clearly moved.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 
@@ -59,9 +59,9 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     """Add weights, promise and band to a diagnosis, and the promise to its sentence."""
     model = result.model
     result = replace(result, weights=weights_of(result.errors_of_sets, len(result.kinds)))
-    runs, stroke = _elsewhere(result), result.stroke
+    runs, fit, stroke = _elsewhere(result), result.runs, result.stroke
     same, other = (
-        blocks_of(model, runs, excess(result, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))
+        blocks_of(model, runs, excess(fit, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))
         for e in (result.held_out.by_segment if result.held_out else {}, result.after.by_segment)
     )
     if same is None or other is None:
@@ -102,13 +102,13 @@ def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
     return [replace(run, predicted=run.predicted + moved[run.record]) for run in runs]
 
 
-def excess(result: Diagnosis, held_out: Mapping[str, float]) -> dict[str, float]:
+def excess(runs: Sequence[JudgedRun], held_out: Mapping[str, float]) -> dict[str, float]:
     """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
     fitted = dict[str, list[Array]]()
-    for r in result.residuals:
-        for label, start, stop in stretches(r.record, r.piece):
+    for run in runs:
+        for label, start, stop in stretches(run.record, run.piece):
             if label in held_out:
-                fitted.setdefault(label, []).append(r.after[start:stop][r.sound[start:stop]])
+                fitted.setdefault(label, []).append(run.error[start:stop][run.use[start:stop]])
     return {
         label: max(held_out[label] - float(np.concatenate(e).var()), 0.0)
         for label, e in fitted.items()

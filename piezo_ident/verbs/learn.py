@@ -15,7 +15,7 @@ from piezo_ident.common.arrays import Array, Mask, true_runs
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.diagnosis import diagnose as diagnosis_alone
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
-from piezo_ident.diagnosis.shared_modes import find_shared_modes, with_shared_modes
+from piezo_ident.diagnosis.shared_modes import find_shared_modes, Multisines, with_shared_modes
 from piezo_ident.diagnosis.shared_modes import NAME as LOOP
 from piezo_ident.identification.identify import identify_and_judge
 from piezo_ident.identification.results import Identification, Steps
@@ -27,6 +27,12 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.record import Piece, Record, records_of
 from piezo_ident.uncertainty.parameters import with_deviations
 from piezo_ident.uncertainty.promises import promised_diagnosis, promised_identification
+from piezo_ident.verbs.learn_modes import (
+    AxesData,
+    chains_were_kept,
+    diagnosed_modes,
+    with_better_modes,
+)
 from piezo_ident.verbs.promised_modes import promised_modes
 
 #: largest change of a voltage at rest, as a share of its range
@@ -35,6 +41,14 @@ RESTS = 1e-3
 LONG = 1.0
 #: length of the blocks in which rest is judged [s]
 BLOCK = 0.25
+#: what a diagnosis does with the choice of an identification between chains and shared modes
+ALREADY_TRIED = (
+    'modes that the axes share were not tried: identify kept chains on the multisines of these '
+    'records'
+)
+TRIED_AGAIN = (
+    'modes that the axes share were tried again: identify kept chains, on other multisines'
+)
 
 
 def identify_axis(
@@ -87,7 +101,9 @@ def identify(
     Returns
     -------
     Identification, or EachAxis of Identification
-        The models of several axes lack the paths between them, which `diagnose` finds.
+        The models of several axes lack the paths between them, which `diagnose` finds.  From
+        multisines of all axes at once, modes that the axes share predict instead of the models if
+        they err clearly less on multisines held out.
 
     Raises
     ------
@@ -133,7 +149,8 @@ def identify(
             unseen, told = [axis_record(r, axis) for r in validation], _named(progress, axis)
             one = identify_axis(parts, settings, validation=unseen, progress=told)
             found[axis] = replace(one, warnings=(*one.warnings, *still))
-    return EachAxis(found)
+    data = AxesData(records, validation, of_axes)
+    return with_better_modes(EachAxis(found), data, progress)
 
 
 @overload
@@ -182,7 +199,8 @@ def diagnose(
     -------
     Diagnosis, or EachAxis of Diagnosis
         Each of several axes is judged with the motions of the others known.  The channel of a
-        `cross_coupling` names the axis that the coupling comes from.
+        `cross_coupling` names the axis that the coupling comes from.  A model with shared modes is
+        judged as it is.
 
     Raises
     ------
@@ -212,9 +230,10 @@ def diagnose(
     """
     if not isinstance(model, MultiAxisModel):
         return diagnose_axis(model, records, settings, progress=progress)
-    model.require_chains('diagnose')
     settings = DiagnosisSettings() if settings is None else settings
     records = records_of(records, 'diagnose, second argument')
+    if model.modes is not None:
+        return diagnosed_modes(model, records, settings)
     seen = [model.seen(record) for record in records]
     found = EachAxis(
         {
@@ -225,7 +244,14 @@ def diagnose(
         }
     )
     names = {*(settings.effects or (LOOP,))} - {*settings.without}
-    shared = find_shared_modes(found.model, records, progress) if LOOP in names else None
+    sines = Multisines.of(model.axes, records) if LOOP in names else None
+    if sines is None:
+        return found
+    if known := chains_were_kept(model, sines):
+        return found.mapped(functools.partial(_warned, ALREADY_TRIED))
+    shared = find_shared_modes(found.model, sines, records, progress)
+    if known is not None:
+        found = found.mapped(functools.partial(_warned, TRIED_AGAIN))
     if shared is None:
         return found
     found = replace(found, modes=shared.modes)
@@ -239,6 +265,10 @@ def diagnose(
         return promised_modes(judged(x, axis), own)
 
     return found.mapped(judged_and_promised)
+
+
+def _warned(text: str, _: str, result: Diagnosis) -> Diagnosis:
+    return replace(result, warnings=(*result.warnings, text))
 
 
 def _named(progress: Progress, axis: str) -> Progress:

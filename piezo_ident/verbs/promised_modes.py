@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 
@@ -13,7 +13,8 @@ import numpy as np
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.multi_axis import SHARED_MODES
-from piezo_ident.selection.judged import JudgedRun
+from piezo_ident.model.stage_model import StageModel
+from piezo_ident.selection.judged import JudgedRun, Promise
 from piezo_ident.uncertainty.calibration import blocks_of, calibrated
 from piezo_ident.uncertainty.promises import excess, promise_of, with_band
 
@@ -23,18 +24,36 @@ def promised_modes(result: Diagnosis, held_out: Mapping[str, float]) -> Diagnosi
     Add promise and band of shared modes to the diagnosis of an axis.
 
     `held_out` has the mean squared error on multisines held out [m^2], by the label of segments.
-    The model keeps errors and band of the modes apart from those of its chain.
     """
-    runs = [
-        JudgedRun(r.record, r.piece, r.piece.y - r.after, r.sound, np.zeros_like(r.sound))
-        for r in result.residuals
-    ]
-    model = replace(result.model, effects=(), identification={})
-    blocks = blocks_of(model, runs, excess(result, held_out))
+    model, promise = judged_modes(result.model, result.runs, held_out, result.stroke)
+    return result if promise is None else replace(result, model=model, promise=promise)
+
+
+def judged_modes(
+    model: StageModel, runs: Sequence[JudgedRun], held_out: Mapping[str, float], stroke: float
+) -> tuple[StageModel, Promise | None]:
+    """
+    Give the model of an axis errors and band of shared modes, apart from those of its chain.
+
+    Without enough samples the model stays as it is, and the promise is None.
+
+    Parameters
+    ----------
+    model : StageModel
+        The chain.
+    runs : sequence of JudgedRun
+        Free runs of the modes.
+    held_out : mapping of str to float
+        Mean squared error on multisines held out [m^2], by the label of segments.
+    stroke : float
+        [m]
+    """
+    bare = replace(model, effects=(), identification={})
+    blocks = blocks_of(bare, runs, excess(runs, held_out))
     if blocks is None:
-        return result
+        return model, None
     band, span = calibrated(blocks), abs(model.scaling.Y)
-    promise = promise_of(blocks, blocks, band, span, result.stroke)
+    promise = promise_of(blocks, blocks, band, span, stroke)
     mean, worst = (
         percent(span * math.sqrt(square), span)
         for square in (
@@ -43,8 +62,5 @@ def promised_modes(result: Diagnosis, held_out: Mapping[str, float]) -> Diagnosi
         )
     )
     known = {'errors': {'after': mean, 'worst': worst}}
-    of_modes = with_band(replace(model, identification={'diagnosis': known}), band).identification
-    identification = {**result.model.identification, SHARED_MODES: of_modes}
-    return replace(
-        result, model=replace(result.model, identification=identification), promise=promise
-    )
+    of_modes = with_band(replace(bare, identification={'diagnosis': known}), band).identification
+    return replace(model, identification={**model.identification, SHARED_MODES: of_modes}), promise

@@ -16,21 +16,7 @@ from piezo_ident.fitting.modes.signals import with_loop_plays, with_softening
 from piezo_ident.identification.settings import silent
 from piezo_ident.model.modes.shared_modes import SharedModes
 import pytest
-
-STAGE = pi.TwoAxisStage.load('two_axes')
-PROGRAM = pi.Program.load('two_axes')
-
-
-def program(*names, **options):
-    entries = (e for e in PROGRAM.entries if e.name in names)
-    return replace(
-        PROGRAM, entries=tuple(replace(e, options={**e.options, **options}) for e in entries)
-    )
-
-
-@functools.cache
-def measured():
-    return STAGE.play(program('small', 'large', realisations=3, periods=3))
+from two_axes_record import chains, FEW, measured, other, program, STAGE
 
 
 def searched(truth, seed=1):
@@ -40,10 +26,8 @@ def searched(truth, seed=1):
 
 @functools.cache
 def diagnosed():
-    record = measured()
-    return pi.diagnose(
-        pi.identify(record).model, record, pi.DiagnosisSettings(effects=('loop_hysteresis',))
-    )
+    only = pi.DiagnosisSettings(effects=('loop_hysteresis',))
+    return pi.diagnose(chains().model, measured(), only)
 
 
 def test_hysteresis_inside_the_loop_fits_best_and_moves_the_modes():
@@ -96,12 +80,11 @@ def test_a_shared_loop_is_named_on_every_axis_and_predicts_another_record():
     assert {e.name for x in result.values() for e in x.effects} == {'loop_hysteresis'}
     assert all(x.after.overall < 0.4 * x.before.overall for x in result.values())
     assert not any(f'({law})' in result['y'].sentence for law in IN_FRONT)
-    other = replace(STAGE, seed=5).play(replace(program('large', realisations=2), seed=77))
-    chains, modes = (
-        pi.free_run(model, other) for model in (pi.MultiAxisModel(result.model.axes), result.model)
+    of_chains, modes = (
+        pi.free_run(x, other()) for x in (pi.MultiAxisModel(result.model.axes), result.model)
     )
     for axis, run in modes.items():
-        assert run.errors.percent < 0.5 * chains[axis].errors.percent
+        assert run.errors.percent < 0.5 * of_chains[axis].errors.percent
     assert 'shared' in repr(result.model)
 
 
@@ -119,15 +102,9 @@ def test_the_file_of_shared_modes_reads_back_bit_by_bit(tmp_path):
         pi.load(tmp_path / 'model.yaml')
 
 
-def test_a_further_diagnosis_refuses_shared_modes():
-    with pytest.raises(ModelError, match='modes that the axes share'):
-        pi.diagnose(diagnosed().model, measured())
-
-
 def test_band_and_promise_of_shared_modes_hold_on_another_record():
     result = diagnosed()
-    other = replace(STAGE, seed=5).play(replace(program('large', realisations=2), seed=77))
-    for axis, run in pi.free_run(result.model, other, 0.9).items():
+    for axis, run in pi.free_run(result.model, other(), 0.9).items():
         assert 0.75 < run.inside <= 1.0
         assert np.median(run.half_widths[0]) < 5 * np.std(run.measured - run.predicted)
         assert 0.5 < run.errors.percent / result[axis].promise.same < 2.0
@@ -149,10 +126,7 @@ def test_the_error_of_an_inverse_is_expected_from_the_modes():
 def test_a_linear_stage_shares_no_loop():
     linear = replace(STAGE, hysteresis=(0.0, 0.4, 1.0), creep_gain=np.zeros(2))
     record = linear.play(program('small', 'large', realisations=2, periods=2))
-    found = pi.diagnose(
-        pi.identify(record).model, record, pi.DiagnosisSettings(effects=('loop_hysteresis',))
-    )
-    assert found.modes is None
+    assert pi.identify(record, FEW).modes is None
 
 
 def test_periods_are_found_and_the_first_is_left_to_settle():

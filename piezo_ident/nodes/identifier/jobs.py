@@ -68,6 +68,7 @@ _SHARES = {
     'residual': (0.02, 0.1),
     'candidates': (0.1, 0.95),
     'verdict': (0.95, 0.98),
+    'shared modes': (0.98, 1.0),
 }
 
 
@@ -219,11 +220,14 @@ def _identified(
 ) -> IdentificationOutcome:
     def figures(x: Identification) -> dict[str, str]:
         error, static = x.headline.percent, x.headline.static_percent
-        return {'error_percent': f'{error:.3g}', 'static_percent': f'{static:.3g}'}
+        known = {'error_percent': error, 'static_percent': static}
+        # shared modes have no hysteresis that acts alone
+        return {k: f'{e:.3g}' for k, e in known.items() if np.isfinite(e) or x.shared is None}
 
     def brief(x: Identification) -> str:
-        error, static = figures(x).values()
-        return f'{error} % of stroke, hysteresis alone {static} %'
+        error, *static = figures(x).values()
+        alone = f', hysteresis alone {static[0]} %' if static else ''
+        return f'{error} % of stroke{alone}'
 
     return IdentificationOutcome(
         message=_joined(result, headline),

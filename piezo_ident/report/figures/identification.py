@@ -143,7 +143,7 @@ def _of_response(dynamics: DynamicsResult) -> str:
 def _refitted(identification: Identification) -> dict[str, float]:
     """Return the held-out error of each record to which H was fitted as a whole later."""
     # a table of orders comes with segments
-    if identification.dynamics.table is not None:
+    if identification.dynamics.table is not None or identification.shared is not None:
         return {}
     rows = identification.errors
     names = dict.fromkeys(row.record for row in rows if row.data == 'fitted')

@@ -170,13 +170,11 @@ def test_the_observer_corrects_the_prediction_of_each_axis():
 
 
 def test_what_runs_chains_alone_refuses_shared_modes():
-    model, v = case(14)
-    record = pi.Record((Piece(v[0], v[0], RATE, channels={'v_b': v[1], 'y_b': v[1]}),), 'both')
+    model, _ = case(14)
     settings = GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
     for verb, act in {
         'feedforward': lambda: prepared(model, AXES[:2], settings, 0, 'off', None),
         'learn': lambda: learn_axes(model, {a: np.zeros(9) for a in AXES[:2]}),
-        'diagnose': lambda: pi.diagnose(model, record),
     }.items():
         with pytest.raises(pi.ModelError, match=f'^{verb}: cannot run the modes') as caught:
             act()
