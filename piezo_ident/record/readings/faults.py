@@ -29,6 +29,7 @@ from piezo_ident.record.readings.jumps import (
     RINGS,
 )
 from piezo_ident.record.record import Fault, Piece, Record
+from scipy.special import bdtrc
 
 #: so many samples in a row with one displacement are no chance
 STUCK = 50
@@ -49,8 +50,9 @@ HELD = 2 * JUMP
 CHANCE, CREEPS = 0.01, 3e-5
 #: least number of repeats in a moving signal, and least share of the moving samples
 REPEATS, REPEATED = 4, 2e-4
-#: least share of the repeats behind which the signal makes up for them
-MADE_UP = 0.7
+#: least share of the repeats behind which the signal makes up for them, and the level of the test
+#: that pauses of the motion, which it makes up for by chance in half of the cases, are so many
+MADE_UP, BY_CHANCE = 0.7, 1e-3
 #: samples that tell the step of a converter, in rows of so many
 MOST, MOST_ROW = 2**17, 2**10
 #: share of that step by which numbers in a file may be rounded
@@ -274,7 +276,9 @@ def _repeated(y: Array, known: Mask) -> Mask:
         by_chance = 2.0 * expected + 6.0 * np.sqrt(expected)
         if count < max(REPEATS, REPEATED * samples) or count <= by_chance:
             continue
-        if float(np.mean(makes_up[equal] > 0.3 * slope[equal])) >= MADE_UP:
+        made = int(np.count_nonzero(makes_up[equal] > 0.3 * slope[equal]))
+        pauses = int(np.count_nonzero(equal))
+        if made >= MADE_UP * pauses and bdtrc(made - 1, pauses, 0.5) < BY_CHANCE:
             for a, b in zip(start[equal], stop[equal], strict=True):
                 found[a + 1 : b] = True
             return found

@@ -15,7 +15,7 @@ from piezo_ident.operators.play import play_columns
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.readings.suspicions import line_error, misspelt, suspicions
 from piezo_ident.record.record import Piece, Record
-from programs import SLOW, slow_model, SLOW_PROGRAM
+from programs import identification_program, SLOW, slow_model, SLOW_PROGRAM
 import pytest
 from scipy.signal import lfilter
 
@@ -335,3 +335,12 @@ def test_steps_rests_and_stops_are_no_lost_readings():
     q = 75e-6 / 2**12
     rests = np.clip(np.round((Y - 20e-6) / q) * q, 0.0, 40e-6)
     assert cleaned(rests, V)[1] == {}
+
+
+@pytest.mark.parametrize('seed', [45, 57, 64, 73])
+def test_pauses_of_fast_motion_are_no_missed_samples(seed):
+    text = identification_program(steps=8, cycles=8, frequency=20, noise=1, slope=40)
+    stage = pi.SimulatedStage.load('paper')
+    v = parse_program(text).build(20_000.0).v[:28_300]
+    y = stage.run(np.random.default_rng(seed)).process(v)
+    assert without_faults(Record((Piece(v, y, 20_000.0),), 'noise')).faults == ()
