@@ -46,6 +46,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
@@ -87,8 +88,14 @@ class Graph(Observer):
             domain_id=self.domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
+        # this service is destroyed twice with its node, which now and then ends the process
+        spared = Parameter('start_type_description_service', value=False)
         self.node = Node(
-            'observer', context=self.context, start_parameter_services=False, enable_rosout=False
+            'observer',
+            context=self.context,
+            start_parameter_services=False,
+            enable_rosout=False,
+            parameter_overrides=[spared],
         )
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
