@@ -37,10 +37,9 @@ STATES = {
 }
 FAILED = ('failed', 'cancelled', 'refused', 'stopped')
 AT_REST = ('idle', 'done', *FAILED)
-#: of the sample clock, in times real time; the next one is tried where samples are lost
+#: of the sample clock and of the replay, in times real time; the next one is tried where samples
+#: are lost
 RATES = (2.0, 1.0, 0.25)
-#: the same of the replay
-REPLAY = (4.0, 1.0, 0.25)
 #: a stream that is silent for so long has ended [s]
 QUIET = 10.0
 #: no limit of the nodes is one that a slow machine meets [s]
@@ -343,7 +342,7 @@ class Lab:
         )
         self.set('replay/player', 'bag', str(recording.bag))
         self.wait(wire.is_matched, REPLAYED)
-        for rate in REPLAY:
+        for rate in RATES:
             self.set('replay/player', 'rate', rate)
             wire.clear()
             self.call('replay/player/start', 'replay')
