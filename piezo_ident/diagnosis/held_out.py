@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.record.record import Piece
+from piezo_ident.selection.judged import JudgedRun
 from piezo_ident.selection.motion_kinds import description, interleaved, KINDS, kinds_of
 
 #: largest number of kinds of motion that are held out in turn
@@ -47,6 +48,15 @@ def stretches(record: str, piece: Piece, m: int = 1) -> list[tuple[str, int, int
     if end < n:
         found.append(('ramp', end, n))
     return found
+
+
+def errors_of_segments(runs: Iterable[JudgedRun]) -> dict[str, Array]:
+    """Collect the errors that count, of all runs together, by the label of their segment [m]."""
+    found = dict[str, list[Array]]()
+    for run in runs:
+        for label, start, stop in stretches(run.record, run.piece):
+            found.setdefault(label, []).append(run.error[start:stop][run.use[start:stop]])
+    return {label: np.concatenate(parts) for label, parts in found.items()}
 
 
 def held_out_kinds(

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -196,6 +196,17 @@ class Residual:
     after: Array
     sound: Mask
 
+    @property
+    def run(self) -> JudgedRun:
+        """Free run of the refined model, as fitted."""
+        none = np.zeros_like(self.sound)
+        return JudgedRun(self.record, self.piece, self.piece.y - self.after, self.sound, none)
+
+
+def stroke_of(residuals: Iterable[Residual]) -> float:
+    """Compute the largest stroke of the pieces [m]."""
+    return max(float(np.ptp(r.piece.y[r.sound])) for r in residuals if r.sound.any())
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Showable):
@@ -306,15 +317,12 @@ class Diagnosis(Showable):
     @property
     def stroke(self) -> float:
         """Largest stroke of the records [m]."""
-        return max(float(np.ptp(r.piece.y[r.sound])) for r in self.residuals if r.sound.any())
+        return stroke_of(self.residuals)
 
     @property
     def runs(self) -> list[JudgedRun]:
         """Free runs of the refined model, as fitted."""
-        return [
-            JudgedRun(r.record, r.piece, r.piece.y - r.after, r.sound, np.zeros_like(r.sound))
-            for r in self.residuals
-        ]
+        return [r.run for r in self.residuals]
 
     @property
     def changes(self) -> tuple[str, ...]:

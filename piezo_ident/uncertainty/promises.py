@@ -22,9 +22,8 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.criteria import MOVED_ZERO
-from piezo_ident.diagnosis.held_out import stretches
+from piezo_ident.diagnosis.held_out import errors_of_segments
 from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
@@ -104,12 +103,8 @@ def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
 
 def excess(runs: Sequence[JudgedRun], held_out: Mapping[str, float]) -> dict[str, float]:
     """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
-    fitted = dict[str, list[Array]]()
-    for run in runs:
-        for label, start, stop in stretches(run.record, run.piece):
-            if label in held_out:
-                fitted.setdefault(label, []).append(run.error[start:stop][run.use[start:stop]])
     return {
-        label: max(held_out[label] - float(np.concatenate(e).var()), 0.0)
-        for label, e in fitted.items()
+        label: max(held_out[label] - float(e.var()), 0.0)
+        for label, e in errors_of_segments(runs).items()
+        if label in held_out
     }

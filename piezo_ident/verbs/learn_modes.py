@@ -12,12 +12,13 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ModelError
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
-from piezo_ident.diagnosis.held_out import stretches
+from piezo_ident.diagnosis.held_out import errors_of_segments
 from piezo_ident.diagnosis.results import (
     Diagnosis,
     DiagnosisSettings,
     Errors,
     Residual,
+    stroke_of,
     Unexplained,
 )
 from piezo_ident.diagnosis.shared_modes import (
@@ -244,13 +245,9 @@ def _judged(model: StageModel, runs: Sequence[FreeRun], settings: DiagnosisSetti
         for piece, y, use in pieces:
             e = piece.y - y - zero
             residuals.append(Residual(run.record.name, piece, e, e, e, use))
-    stroke = max(float(np.ptp(r.piece.y[r.sound])) for r in residuals if r.sound.any())
-    of_label: dict[str, list[Array]] = {'': []}
-    for r in residuals:
-        of_label[''].append(r.after[r.sound])
-        for label, start, stop in stretches(r.record, r.piece):
-            of_label.setdefault(label, []).append(r.after[start:stop][r.sound[start:stop]])
-    joined = {label: np.concatenate(e) for label, e in of_label.items()}
+    stroke, joined = stroke_of(residuals), errors_of_segments(r.run for r in residuals)
+    # each row is in a segment
+    joined[''] = np.concatenate([*joined.values()])
     rms = {k: percent(np.sqrt(np.mean(e**2)), stroke) for k, e in joined.items() if e.size}
     errors = Errors(rms.pop(''), rms, {})
     parts = [ResidualPart(r.record, r.piece, r.after, r.sound) for r in residuals]
