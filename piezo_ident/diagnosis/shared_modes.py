@@ -309,15 +309,13 @@ class LawSearch:
 
 
 def with_shared_modes(
-    result: Diagnosis, axis: str, finding: SharedModesFinding, model: MultiAxisModel,
-    records: Sequence[Record],
-) -> Diagnosis:  # fmt: skip
-    """Name the hysteresis of shared modes in the diagnosis of an axis."""
-    predicted = {
-        (record.name, piece.start_time): y_hat
-        for record in records
-        for piece, y_hat in zip(record, model.predicted(record)[axis], strict=True)
-    }
+    result: Diagnosis, finding: SharedModesFinding, predicted: Mapping[tuple[str, float], Array]
+) -> Diagnosis:
+    """
+    Name the hysteresis of shared modes in the diagnosis of an axis.
+
+    The modes have `predicted` its displacement [m], by record and start of the piece [s].
+    """
     residuals = []
     for x in result.residuals:
         e = x.piece.y - predicted[x.record, x.piece.start_time][: x.piece.n]

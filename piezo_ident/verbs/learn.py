@@ -255,14 +255,17 @@ def diagnose(
     if shared is None:
         return found
     found = replace(found, modes=shared.modes)
-    judged = functools.partial(
-        with_shared_modes, finding=shared, model=found.model, records=records
-    )
+    predicted = [(record, found.model.predicted(record)) for record in records]
     order = sorted(found)
 
     def judged_and_promised(axis: str, x: Diagnosis) -> Diagnosis:
+        runs = {
+            (record.name, piece.start_time): y
+            for record, of in predicted
+            for piece, y in zip(record, of[axis], strict=True)
+        }
         own = {label: float(of[order.index(axis)]) for label, of in shared.held_out.items()}
-        return promised_modes(judged(x, axis), own)
+        return promised_modes(with_shared_modes(x, shared, runs), own)
 
     return found.mapped(judged_and_promised)
 
