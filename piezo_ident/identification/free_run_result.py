@@ -61,7 +61,7 @@ def outcome_of(
     memories = {key: _start(stage, i, chosen[i], model) for key, i in own.items()}
     at_test = {key: _start(judged, i, chosen[i], tested) for key, i in own.items()}
     offsets = {
-        key: scaling.Y * float(judged.offsets[i] - judged.offsets[0]) for key, i in own.items()
+        key: scaling.Y * float(judged.offsets[i] - judged.offsets[-1]) for key, i in own.items()
     }
     nothing = [np.zeros(run.piece.n, dtype=bool) for run in runs]
     fitted = dict(zip(map(id, chosen), parts, strict=True))
@@ -95,10 +95,11 @@ def outcome_of(
 
 
 def _model(stage: Stage, rate: float, scaling: Scaling) -> StageModel:
+    # the zero of the sensor may have moved between records; the last one holds for new records
     seen = stage.creep > 0.0
     values = {'gain': stage.creep[seen].tolist(), 'time_constant': stage.taus[seen].tolist()}
     effects = (EffectSetting('creep', values),) if seen.any() else ()
-    moved = replace(scaling, y0=scaling.y0 + float(stage.offsets[0]) * scaling.Y)
+    moved = replace(scaling, y0=scaling.y0 + float(stage.offsets[-1]) * scaling.Y)
     H = _compact(stage.hysteresis)
     return StageModel(rate, moved, H, stage.dynamics, Delay(stage.delay), effects)
 

@@ -49,8 +49,8 @@ SMALLER = (8, 4)
 def model_of(
     rate: float, scaling: Scaling, fit: HysteresisFit, G: Dynamics, delay: Delay
 ) -> StageModel:
-    """Build the model; the offset of the fit moves its zero of displacement."""
-    moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[0]) * scaling.Y)
+    """Build the model; its zero of displacement is that of the last fitted excerpt."""
+    moved = replace(scaling, y0=scaling.y0 + float(fit.offsets[-1]) * scaling.Y)
     return StageModel(rate, moved, fit.hysteresis, G, delay)
 
 

@@ -88,7 +88,8 @@ def identify(
         steps; their other segments serve for validation.  Records without these segments are
         fitted as a whole, except for a part that is held out.  Columns ``v_<name>`` and
         ``y_<name>`` beside ``v`` and ``y`` are further axes.  The axes may move at once or one
-        after the other, in one record or in several.
+        after the other, in one record or in several.  The last record gives the zero of
+        displacement, so give them in the order in which they were recorded.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
         Unseen records, which take no part in the fit; the headline gives the error on them.

@@ -11,6 +11,7 @@ from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.settings import Settings
+from piezo_ident.model.free_run import free_run
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -112,7 +113,10 @@ def test_several_records_are_all_fitted_each_with_its_own_zero():
     of = {row.record: row for row in result.errors if row.data == 'fitted'}
     assert set(of) == {'one', 'two'}
     assert max(row.percent for row in result.errors) < 0.5
-    assert any('two: its zero of displacement' in said for said in result.warnings)
+    assert any('one: its zero of displacement' in said for said in result.warnings)
+    # the model has the zero of the last record, where the sensor was last
+    later = record('later', sine(1.0, f=3.0), 4e-6, 2)
+    assert abs(free_run(result.model, later).errors.offset) < 0.1e-6
 
 
 def test_a_multisine_does_not_only_jump():
