@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
-from piezo_ident.control.linear_inverse import cut, LONGEST, reach_of, SHORTEST
+from piezo_ident.control.linear_inverse import cut, LONGEST, past_of, reach_of, SHORTEST
 from piezo_ident.model.modes.modal import Modal
 from scipy.signal import oaconvolve
 
@@ -41,6 +41,13 @@ class AxesFilter(NamedTuple):
     def reach(self) -> int:
         """Distance beyond which a sample matters less than `REACH`."""
         return reach_of(_size(self.taps), self.ahead)
+
+    def shortened(self, most: int) -> AxesFilter:
+        """Limit the samples ahead to `most`; the static gain stays."""
+        ahead, behind = min(self.ahead, most), past_of(_size(self.taps), self.behind)
+        taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
+        static = self.taps.sum(axis=0) @ np.linalg.inv(taps.sum(axis=0))
+        return AxesFilter(static @ taps, ahead, behind)
 
     def __call__(self, x: Array) -> Array:
         """Filter signals of shape (n, inputs) that rest before and after their samples."""

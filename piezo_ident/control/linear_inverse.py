@@ -81,10 +81,7 @@ class LinearInverse:
 
     def shortened(self, most: int) -> LinearInverse:
         """Limit the samples ahead to `most`; the static gain stays."""
-        ahead = min(self.ahead, most)
-        size = np.abs(self.taps[::-1])
-        idle = int(np.argmax(np.cumsum(size) > MISSED * size.sum()))
-        behind = min(max(self.behind - idle, 0), MOST_BEHIND)
+        ahead, behind = min(self.ahead, most), past_of(np.abs(self.taps), self.behind)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
         return LinearInverse(taps * (self.taps.sum() / taps.sum()), ahead, behind)
 
@@ -92,6 +89,12 @@ class LinearInverse:
         """Filter a signal of shape (n,) that rests before and after its samples."""
         padded = np.pad(x, (self.behind, self.ahead), mode='edge')
         return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
+
+
+def past_of(size: Array, behind: int) -> int:
+    """Shorten the past of a filter, `behind` samples, to the part that counts by its sizes."""
+    idle = int(np.argmax(np.cumsum(size[::-1]) > MISSED * size.sum()))
+    return min(max(behind - idle, 0), MOST_BEHIND)
 
 
 def reach_of(size: Array, ahead: int) -> int:

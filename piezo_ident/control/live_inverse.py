@@ -170,9 +170,7 @@ class LiveInverse:
         """Choose the number of passes on a trial motion; the number and its error."""
         stream = self.model.stream()
         low, high, rest = (stream.reset(v) for v in (*self._limits, self._rest))
-        k = np.arange(TRIAL)
-        motion = sum(a * np.sin(2 * np.pi * k / period) for period, a in SINES)
-        fade = 0.5 - 0.5 * np.cos(np.pi * np.minimum(k / SINES[0][0], 1.0))
+        fade, motion = trial_motion()
         wanted = rest + fade * (0.5 * (low + high) - rest + (high - low) * motion)
         best, least = 1, np.inf
         for passes in range(1, MOST_PASSES + 1):
@@ -251,6 +249,13 @@ class LiveInverse:
         for p in self._passes:
             x, d, w, u, short = p.process(x, d, w)
         return Driven(np.clip(s.v0 + s.V * u, *self._limits), short)
+
+
+def trial_motion(stretch: float = 1.0) -> tuple[Array, Array]:
+    """Make a rise from 0 to 1, and the sines of the trial, whose periods are stretched."""
+    k = np.arange(TRIAL)
+    motion = np.sum([a * np.sin(2 * np.pi * k / (stretch * t)) for t, a in SINES], axis=0)
+    return 0.5 - 0.5 * np.cos(np.pi * np.minimum(k / SINES[0][0], 1.0)), motion
 
 
 class _Pass:

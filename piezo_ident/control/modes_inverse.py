@@ -109,6 +109,26 @@ def invert_modes(
     return _results(task, best, clip)
 
 
+class Limited:
+    """Keeps voltages about v0 within limits [V] and slew [V/s]; begin with `reset`."""
+
+    def __init__(self, low: Array, high: Array, slew: float, sample_rate: float) -> None:
+        self._low, self._high = low, high
+        self._guards = [SlewLimit(sample_rate, {'limit': slew}) for _ in low]
+
+    def reset(self, u: Array) -> None:
+        """Come to rest under voltages, shape (k,)."""
+        for guard, x in zip(self._guards, np.clip(u, self._low, self._high).tolist(), strict=True):
+            guard.reset(x, x)
+
+    def process(self, u: Array) -> Array:
+        """Limit the next voltages, shape (n, k)."""
+        columns, t = [], np.zeros(len(u))
+        for guard, x in zip(self._guards, np.clip(u, self._low, self._high).T, strict=True):
+            columns.append(guard.process(Block(t=t, v=x, x=np.ascontiguousarray(x))).x)
+        return np.column_stack(columns)
+
+
 class _Pass(NamedTuple):
     """Voltages about v0, error, samples out of reach, and rms error of the rest [spans]."""
 
@@ -190,16 +210,9 @@ class _Task:
 
     def limited(self, u: Array) -> Array:
         """Keep voltages about v0 within limits and slew."""
-        u = np.clip(u, self.low, self.high)
-        if np.isinf(self.step):
-            return u
-        t, columns = np.arange(len(u)) / self.model.sample_rate, []
-        for x in u.T:
-            guard = SlewLimit(self.model.sample_rate, {'limit': self.step})
-            guard.reset(float(x[0]), float(x[0]))
-            x = np.ascontiguousarray(x)
-            columns.append(guard.process(Block(t=t, v=x, x=x)).x)
-        return np.column_stack(columns)
+        limited = Limited(self.low, self.high, self.step, self.model.sample_rate)
+        limited.reset(u[0])
+        return limited.process(u)
 
     def motion(self, u: Array) -> Array:
         """Simulate the displacements under voltages about v0 [m]."""
@@ -252,7 +265,7 @@ def _iterated(task: _Task) -> _Solved:
     begun = first.tried(task, first.x, 1)
     filters, best = first, begun
     if np.isfinite(begun.left) and task.modes.signals:
-        filters = _Filters.of(task, _gains(task.modes, begun.u))
+        filters = _Filters.of(task, signal_gains(task.modes, begun.u))
     m, steps, stalls = filters.x, _Anderson(), 0
     for passes in range(2, PASSES + 1):
         now = filters.tried(task, m, passes)
@@ -275,7 +288,7 @@ def _iterated(task: _Task) -> _Solved:
     return _Solved(best, filters)
 
 
-def _gains(modes: SharedModes, u: Array) -> Array:
+def signal_gains(modes: SharedModes, u: Array) -> Array:
     """Compute the gain of each signal for which gain times z is nearest to p."""
     run = modes.run(u)
     z, p = (x - x.mean(axis=0) for x in (run.z, run.p))

@@ -4,10 +4,10 @@
 """
 Drive one axis along a wanted motion, block by block, through new references and new models.
 
-The axis joins a new reference along a raised cosine in metres, from the position of the stage.
-A new model takes over in the state that it would have if it had run from the start.  The axis
-then joins the reference from the position that the new model predicts, so the voltage does not
-jump.  A guard limits the voltage in the end.
+An inverse of the axis, or of all axes, makes the voltage.  The axis joins a new reference along a
+raised cosine in metres, from the position of the stage.  A new model takes over in the state that
+it would have if it had run from the start.  The axis then joins the reference from the position
+that the new model predicts, so the voltage does not jump.  A guard limits the voltage in the end.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import threading
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.live_inverse import LiveInverse
 from piezo_ident.live.follower import Follower
@@ -58,33 +58,49 @@ class Successor:
     run: Stream | None = None
 
 
+def check_rate(model: StageModel, settings: GuardSettings) -> None:
+    """Refuse a model of another rate than that of the reference with a ModelError."""
+    if abs(model.sample_rate / settings.sample_rate - 1.0) > 1e-6:
+        raise ModelError(
+            f'the reference is sampled at {settings.sample_rate:g} Hz, the model holds for '
+            f'{model.sample_rate:g} Hz; identify a model at the rate of the reference'
+        )
+
+
+def inverse_of(model: StageModel, settings: GuardSettings, preview: int) -> LiveInverse:
+    """Invert the model of an axis within the limits."""
+    check_rate(model, settings)
+    s = settings
+    return LiveInverse(model, limits=(s.low, s.high), slew=s.slew, preview=preview, rest=s.rest)
+
+
 class AxisDrive:
     """
-    Drives one axis with its model; parameters and errors as for `Tracker`.
+    Drives one axis by the voltage of an inverse; parameters and errors as for `Tracker`.
+
+    Parameters
+    ----------
+    start : float
+        Displacement at rest [m].
 
     Attributes
     ----------
-    inverse : LiveInverse
     follower : Follower or None
         Corrects the goal by the measured error; None if `follow` is ``'off'``.
-    rest_shift : float
-        What other axes move of this axis at rest [m]; used by the next `reset`.
     """
 
     def __init__(
-        self, model: StageModel, settings: GuardSettings, preview: int, follow: str
+        self, model: StageModel, settings: GuardSettings, preview: int, follow: str, start: float
     ) -> None:
+        self._model = model
         self._settings, self._preview, self._follow = settings, preview, follow
-        self.inverse = self._built(model)
-        self.rest_shift = 0.0
         self._lock = threading.Lock()
-        self.reset()
+        self.reset(start)
 
-    def reset(self) -> None:
-        """Begin at rest, with the clock of the voltage at zero."""
+    def reset(self, start: float) -> None:
+        """Begin at rest at a displacement [m], with the clock of the voltage at zero."""
         self._guard, self._past = Guard(self._settings), History()
-        self.inverse.reset()
-        self._start = self.inverse.position + self.rest_shift
+        self._start = start
         self._raw = self._wanted = np.full(self._preview, self._start)
         self._join = _Join(self._start, self._step())
         self.follower = self._new_follower()
@@ -94,7 +110,7 @@ class AxisDrive:
             return None
         before = None if stream is None else self.follower
         known = before is not None and before.corrector.knows_memory
-        gain, model = self._follow == 'gain', self.inverse.model
+        gain, model = self._follow == 'gain', self._model
         return Follower(model, gain, self._step(), (stream or model.stream(), self.tick), known)
 
     @property
@@ -112,20 +128,9 @@ class AxisDrive:
         """Whether the voltage of rest was sent last."""
         return self._guard.is_at_rest
 
-    def _built(self, model: StageModel) -> LiveInverse:
-        s = self._settings
-        if abs(model.sample_rate / s.sample_rate - 1.0) > 1e-6:
-            raise ModelError(
-                f'the reference is sampled at {s.sample_rate:g} Hz, the model holds for '
-                f'{model.sample_rate:g} Hz; identify a model at the rate of the reference'
-            )
-        return LiveInverse(
-            model, limits=(s.low, s.high), slew=s.slew, preview=self._preview, rest=s.rest
-        )
-
     def _step(self) -> float:
         """Return the largest change from one sample of a ramp to the next [m]."""
-        scaling = self.inverse.model.scaling
+        scaling = self._model.scaling
         return self._settings.ramp_step * abs(scaling.Y / scaling.V)
 
     def joined(self, reference: ArrayLike, restarted: bool) -> Array:
@@ -138,17 +143,18 @@ class AxisDrive:
         self._raw = np.append(self._raw, raw)[-self._preview :]
         return self._join.process(raw)
 
-    def drive(self, wanted: Array, goal: Array) -> Drive:
-        """Drive the model along a goal [m], which moves the stage along the wanted motion [m]."""
+    def corrected(self, wanted: Array, goal: Array) -> Array:
+        """Correct the goal of the model [m], which moves the stage along the wanted motion [m]."""
         self._wanted = np.append(self._wanted, wanted)
-        if self.follower is not None:
-            goal = self.follower.process(goal, self._preview + 1)
-        driven = self.inverse.process(goal)
-        v = self._guard.process(driven.v).voltage
+        return goal if self.follower is None else self.follower.process(goal, self._preview + 1)
+
+    def drive(self, v: Array, clipped: Mask) -> Drive:
+        """Send the next voltage [V] of the inverse, with the mask of its clipped samples."""
+        v = self._guard.process(v).voltage
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
         # an axis that nobody moves has no reference that could be out of reach
-        clipped = int(np.count_nonzero(driven.clipped & (now != self._start)))
-        return Drive(self._sent(v), v, now, clipped)
+        missed = int(np.count_nonzero(clipped & (now != self._start)))
+        return Drive(self._sent(v), v, now, missed)
 
     def measured(self, samples: Samples) -> None:
         """Take a block of displacement [m], on the clock of the voltage."""
@@ -180,7 +186,7 @@ class AxisDrive:
 
     def successor(self, model: StageModel, past: History) -> Successor:
         """Bring a model into the state after a `past`; any thread may call this."""
-        inverse, run = self._built(model), None
+        inverse, run = inverse_of(model, self._settings, self._preview), None
         if past:
             period = 1.0 / self._settings.sample_rate
             _, v = past.recall(inverse, model, period)
@@ -197,22 +203,23 @@ class AxisDrive:
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
-        self.inverse = successor.inverse
+        inverse, run = successor.inverse, successor.run
+        self._model = inverse.model
         if not self.tick:
-            self.reset()
+            inverse.reset()
+            self.reset(inverse.position)
             return
-        run = successor.run
         if self.tick > successor.count:
             v = self._past.since(successor.count)
-            self.inverse.follow(v, successor.count)
+            inverse.follow(v, successor.count)
             if run is not None:
                 t = np.arange(successor.count, self.tick) / self._settings.sample_rate
                 run.process(v, t)
         self.follower = self._new_follower(run)
         # the voltage is moving, so the joined motion must move from its first sample
-        self._join = _Join(self.inverse.position, self._step(), moves=True)
+        self._join = _Join(inverse.position, self._step(), moves=True)
         self._wanted = self._join.process(self._raw)
-        self.inverse.process(self._wanted)
+        inverse.process(self._wanted)
 
 
 class _Join:

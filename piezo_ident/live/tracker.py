@@ -4,9 +4,8 @@
 """
 Turn the reference of a stage into its voltage, block by block.
 
-An `AxisDrive` moves each axis by its own voltage.  In a stage of several axes, the goal of this
-motion is the wanted motion less what the paths from the other axes add.  The motion of the other
-axes is the wanted one at first, then the goal of the round before, as in `piezo_ident.invert`.
+An `AxisDrive` joins, corrects and guards each axis.  `LiveChains` or `LiveModesInverse` makes the
+voltages of all axes.
 """
 
 from __future__ import annotations
@@ -19,21 +18,17 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inputs import FAR
+from piezo_ident.control.live_axes import LiveChains
 from piezo_ident.control.live_inverse import PREVIEW
-from piezo_ident.effects import find_effect
-from piezo_ident.live.axis_drive import AxisDrive, Drive, Successor
+from piezo_ident.control.live_modes import LiveModesInverse
+from piezo_ident.live.axis_drive import AxisDrive, check_rate, Drive, inverse_of, Successor
 from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.history import History
 from piezo_ident.live.predictor import check_axes
-from piezo_ident.model.axis_records import MOTION, motion_of
 from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.operators.chain import Block
 from piezo_ident.record.blocks import Samples
-
-#: rounds over the paths: each leaves a share of the error that is the size of a path, 0.5 .. 3 %
-ROUNDS = 3
 
 
 class Tracker:
@@ -80,24 +75,29 @@ class Tracker:
         axes: Sequence[str] = ('y',),
     ) -> None:
         self.settings, self.preview, self.follow = settings, preview, follow
-        single = alone(model)
-        self._each = [AxisDrive(single[axis], settings, preview, follow) for axis in axes]
-        self._paths = list[_Paths]()
-        self._felt: _Paths | None = None
-        if isinstance(model, MultiAxisModel):
-            *self._paths, self._felt = (_Paths(model, axes) for _ in range(ROUNDS + 1))
-            rest = np.array([[one.inverse.position] for one in self._each])
-            for one, shift in zip(self._each, self._paths[0].process(rest)[:, 0], strict=True):
-                one.rest_shift = float(shift)
-            self.reset()
+        single = [alone(model)[axis] for axis in axes]
+        self._inverse: LiveChains | LiveModesInverse
+        if isinstance(model, MultiAxisModel) and model.modes is not None:
+            s = settings
+            check_rate(single[0], s)
+            limits = (s.low, s.high)
+            self._inverse = LiveModesInverse(
+                model, axes, limits=limits, slew=s.slew, preview=preview, rest=s.rest
+            )
+        else:
+            each = [inverse_of(x, settings, preview) for x in single]
+            self._inverse = LiveChains(each, model, axes)
+        self._each = [
+            AxisDrive(x, settings, preview, follow, start)
+            for x, start in zip(self._inverse.models, self._inverse.position, strict=True)
+        ]
+        self.reset()
 
     def reset(self) -> None:
         """Begin at rest, with the clock of the voltages at zero."""
-        for one in self._each:
-            one.reset()
-        for paths in (*self._paths, self._felt):
-            if paths is not None:
-                paths.reset()
+        self._inverse.reset()
+        for one, start in zip(self._each, self._inverse.position.tolist(), strict=True):
+            one.reset(start)
 
     @property
     def followers(self) -> list[Follower]:
@@ -112,12 +112,12 @@ class Tracker:
     @property
     def passes(self) -> int:
         """Largest number of passes of the inverses."""
-        return max(one.inverse.passes for one in self._each)
+        return self._inverse.passes
 
     @property
     def expected(self) -> float:
         """Largest error that the finite preview leaves [% of stroke]."""
-        return max(one.inverse.error for one in self._each)
+        return self._inverse.error
 
     @property
     def tick(self) -> int:
@@ -147,12 +147,12 @@ class Tracker:
         Drive
             As many samples of voltage; each belongs to the reference `preview` samples before.
         """
-        rows = zip(self._each, np.atleast_2d(reference), strict=True)
+        each = self._each
+        rows = zip(each, np.atleast_2d(reference), strict=True)
         wanted = np.stack([one.joined(row, restarted) for one, row in rows])
-        goals = wanted
-        for paths in self._paths:
-            goals = wanted - paths.process(goals)
-        drives = [one.drive(*x) for one, *x in zip(self._each, wanted, goals, strict=True)]
+        goals = zip(each, wanted, self._inverse.goals(wanted), strict=True)
+        driven = self._inverse.process(np.stack([one.corrected(*x) for one, *x in goals]))
+        drives = [one.drive(*x) for one, *x in zip(each, *driven, strict=True)]
         v, now = (_rows([getattr(drive, x) for drive in drives]) for x in ('v', 'wanted'))
         self._follow(drives[0].t, v)
         return Drive(drives[0].t, v, now, sum(drive.clipped for drive in drives))
@@ -162,8 +162,8 @@ class Tracker:
         if not (followers := self.followers) or not t.size:
             return
         rows = np.atleast_2d(v)
-        moved = np.stack([one.moved(t, row) for one, row in zip(followers, rows, strict=True)])
-        felt = np.zeros(moved.shape) if self._felt is None else self._felt.process(moved)
+        own = np.stack([one.moved(t, row) for one, row in zip(followers, rows, strict=True)])
+        moved, felt = self._inverse.moved(rows, own)
         for one, *of_axis in zip(followers, rows, moved, felt, strict=True):
             one.drove(t, *of_axis)
 
@@ -207,6 +207,8 @@ class Tracker:
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
         self._each[0].take_over(successor)
+        if isinstance(self._inverse, LiveChains):
+            self._inverse.each[0] = successor.inverse
 
 
 def _rows(of_axes: list[Array]) -> Array:
@@ -238,9 +240,9 @@ def prepared(
         When the model has other axes.
     """
     check_axes(model, axes)
-    if isinstance(model, MultiAxisModel):
-        model.require_chains('feedforward')
     if not axes[1:]:
+        if isinstance(model, MultiAxisModel):
+            model.require_chains('feedforward of one axis')
         (model,) = models_of(model).values()
         if now is not None and (now.settings, now.follow) == (settings, follow):
             return model, now.successor(model, now.past())
@@ -256,38 +258,3 @@ def check_unit(model: StageModel, x: Array) -> None:
             f'it wants the stage {1e6 * least:.3g} um away, which moves by '
             f'{1e6 * abs(s.Y):.3g} um; is the reference in metres?'
         )
-
-
-class _Paths:
-    """What each axis feels of the motions of the others by their own voltages [m]."""
-
-    def __init__(self, model: MultiAxisModel, axes: Sequence[str]) -> None:
-        self._model, self._axes = model, tuple(axes)
-        self.reset()
-
-    def reset(self) -> None:
-        """Come to rest under the next sample."""
-        models = [self._model.axes[axis] for axis in self._axes]
-        self._operators = [
-            [
-                find_effect(e.name)(x.sample_rate, e.parameters)
-                for e in x.effects
-                if e.channel.startswith(MOTION)
-            ]
-            for x in models
-        ]
-        self._spans = [x.scaling.Y for x in models]
-        for operator in (one for row in self._operators for one in row):
-            operator.reset(0.0, 0.0)
-
-    def process(self, moved: Array) -> Array:
-        """Pass the next motions [m] through the paths; shapes (k, n)."""
-        channels = {motion_of(a): row for a, row in zip(self._axes, moved, strict=True)}
-        still = np.zeros(moved.shape[1])
-        felt = []
-        for operators, span in zip(self._operators, self._spans, strict=True):
-            block = Block(t=still, v=still, x=still, channels=channels)
-            for operator in operators:
-                block = operator.process(block)
-            felt.append(span * block.x)
-        return np.stack(felt)

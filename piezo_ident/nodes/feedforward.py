@@ -14,9 +14,9 @@ and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its li
 the error stops falling.  A further call goes on from the best repetition.
 
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
-axes do to one another.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
-axes at the same t.  An axis without a reference stays at rest.  Another model waits until the next
-``~/start`` or ``~/learn``.
+axes do to one another; modes that they share are inverted for all axes together.  A block of
+`reference` waits up to `PATIENCE` for the blocks of the other axes at the same t.  An axis without
+a reference stays at rest.  Another model waits until the next ``~/start`` or ``~/learn``.
 
 With `follow` an observer of each axis finds offset, creep of earlier motion, and gain in its
 displacement, and the node corrects the voltage by them.
@@ -32,6 +32,7 @@ from the stage, as in micrometres | the block is refused | WARN |
 | a gap up to `silence` | a straight line | WARN |
 | another stream | is joined from where the first one ended | |
 | out of reach | the voltage stays at its limit | WARN |
+| modes that run away | the node ramps to rest and fails | WARN |
 
 Without displacement the node drives on, warns, and has no tracking error.
 """
@@ -44,7 +45,7 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.errors import ConfigError, DataError
+from piezo_ident.common.errors import ConfigError, DataError, ModelError
 from piezo_ident.live.axis_drive import Drive, Successor
 from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
@@ -228,7 +229,10 @@ class FeedforwardNode(DrivingNode):
             self._faults.note('refused', f'a block is refused: {error}')
         else:
             self._wanted.join.add(tail, samples, time.monotonic(), sequence)
-            self._take_complete()
+            try:
+                self._take_complete()
+            except ModelError as error:  # modes that run away
+                self._halt('failed', str(error))
             self._busy += time.perf_counter() - begin
         self.report_state()
 
