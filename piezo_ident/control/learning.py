@@ -87,6 +87,8 @@ class Learning:
     ----------
     drive : Inverse
         The next voltage to play; its `wanted` is the corrected motion.
+    reference : ndarray, shape (n,)
+        The corrected motion without the lead [m].
     repetitions : list of Repetition
         Runs so far.
 
@@ -126,12 +128,12 @@ class Learning:
         self._invert = partial(
             invert, model, limits=limits, slew=slew, clip=True, channels=channels
         )
-        self.drive = self._invert(wanted, clip=clip)
-        self._best_drive = self.drive
-        self._wanted = self._reference = self._best_reference = self.drive.wanted[
-            self.drive.lead :
-        ]
-        reached = ~self.drive.clipped[self.drive.lead :]
+        self._begin(model, self._invert(wanted, clip=clip), corner)
+
+    def _begin(self, model: StageModel, drive: Inverse, corner: float | None) -> None:
+        self.drive = self._best_drive = drive
+        self._wanted = self.reference = self._best_reference = drive.wanted[drive.lead :]
+        reached = ~drive.clipped[drive.lead :]
         self._counts = reached if reached.any() else ~reached
         self._model_span = abs(model.scaling.Y)
         self._span = float(np.ptp(self._wanted)) or self._model_span
@@ -165,7 +167,9 @@ class Learning:
 
     def take(self, measured: ArrayLike) -> float:
         """
-        Learn from the displacement measured under `drive`, and return its error [% of stroke].
+        Learn from the displacement measured under `drive`, and plan the next drive.
+
+        The result is the error of the displacement [% of stroke].
 
         A straight line bridges a few wild readings.
 
@@ -180,6 +184,13 @@ class Learning:
             When the number of samples is wrong, a sample is not finite, or the displacement is
             far off or moves unlike the model.
         """
+        error = self.learn(measured)
+        # another voltage of the same motion would err elsewhere
+        self.drive = self._invert(self.reference, like=self._best_drive)
+        return error
+
+    def learn(self, measured: ArrayLike) -> float:
+        """Correct the reference as `take` does; the drive stays."""
         drive = self.drive
         try:
             y = np.asarray(measured, dtype=np.float64)
@@ -206,7 +217,7 @@ class Learning:
         if error <= self.best.error or shape <= min(before):
             # an error out of reach would grow from run to run
             self._missed = np.where(self._counts & ~drive.clipped[drive.lead :], e, 0.0)
-            self._best_reference, self._best_drive = self._reference, drive
+            self._best_reference, self._best_drive = self.reference, drive
             self._is_wider = self._may_widen and bool(before) and shape > SLOW * min(before)
             self._is_wider &= WIDER * self.corner <= OF_RATE * self._rate
             if self._is_wider:
@@ -218,9 +229,7 @@ class Learning:
         else:
             self._step *= 0.5
         correction = smoothed(self._missed, self.corner, self._rate)
-        self._reference = self._best_reference + self._step * correction
-        # another voltage of the same motion would err elsewhere
-        self.drive = self._invert(self._reference, like=self._best_drive)
+        self.reference = self._best_reference + self._step * correction
         return error
 
     def _doubts(self, y: Array) -> Iterator[str]:
@@ -235,6 +244,22 @@ class Learning:
         # the displacement of another axis hardly correlates with the model
         if runs_against(pieces, self._model_span, below=WITH):
             yield REVERSED
+
+
+class SharedLearning(Learning):
+    """
+    A repeated motion of an axis, whose drives come from an inverse of all axes.
+
+    Parameters
+    ----------
+    model : StageModel
+        Model of the axis, with scaling and modes.
+    drive : Inverse
+        First drive.  After each `learn` the caller sets the next one.
+    """
+
+    def __init__(self, model: StageModel, drive: Inverse) -> None:
+        self._begin(model, drive, None)
 
 
 def _bridged(e: Array, stroke: float, y: Array) -> Array:

@@ -17,14 +17,14 @@ import time
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import ConfigError, DataError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError, PiezoIdentError
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.live.pacing import Pace, SLIP
 from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import BLOCK_SIZE, Samples
-from piezo_ident.verbs.invert import learn_axes
+from piezo_ident.verbs.learn_motion import AxesLearning
 
 #: wait at the first voltage before a repetition begins [s]
 SETTLE = 0.05
@@ -55,8 +55,8 @@ class LiveLearning:
     ) -> None:
         self.model, self.reference, self._settings = model, reference, settings
         limits, rows = (settings.low, settings.high), dict(zip(axes, reference, strict=True))
-        each = learn_axes(model, rows, limits=limits, slew=settings.slew)
-        self.each = {axis: each[axis] for axis in axes}
+        self._learning = AxesLearning(model, rows, limits=limits, slew=settings.slew)
+        self.each = {axis: self._learning.each[axis] for axis in axes}
         self.again()
 
     def again(self) -> None:
@@ -98,13 +98,7 @@ class LiveLearning:
     def take(self) -> None:
         """Learn from the measured displacement, and plan the next repetition."""
         try:
-            for axis, y in zip(self.each, self._measured, strict=True):
-                one = self.each[axis]
-                one.take(y[-one.drive.v.size :])
-        except DataError as error:
-            if len(self.each) == 1:
-                raise
-            raise DataError(f'{axis}: {error}') from error
+            self._learning.take(dict(zip(self.each, self._measured, strict=True)))
         finally:
             # the plan of the axes that have learnt has changed
             self.again()

@@ -16,7 +16,6 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.control.inputs import checked_motion
 from piezo_ident.control.inverse import Inverse
 from piezo_ident.control.inverse import invert as invert_axis
-from piezo_ident.control.learning import Learning
 from piezo_ident.control.modes_inverse import invert_modes
 from piezo_ident.model.axis_records import motion_of, voltage_of
 from piezo_ident.model.metrics import percent_of_stroke
@@ -175,36 +174,6 @@ def _driven(
         goal, whole = one.wanted[one.lead :], abs(model.axes[k].scaling.Y)
         errors[k] = percent_of_stroke(goal, predicted[k][lead:], None if np.ptp(goal) else whole)
     return MultiAxisInverse(found, v, predicted, lead, errors)
-
-
-def learn_axes(
-    model: StageModel | MultiAxisModel, wanted: Mapping[str, Array], **options: Any
-) -> dict[str, Learning]:
-    """
-    Begin to learn a motion of all axes of a stage, each by a `Learning` of its own.
-
-    Each axis takes the motions of the others as known: those along the wanted motion, which all
-    come near to from run to run.  An axis that stands still comes as near to its place as the
-    limits allow.
-
-    Parameters
-    ----------
-    model : StageModel or MultiAxisModel
-    wanted : mapping of str to ndarray, shape (n,)
-        Displacement of every axis [m].
-    **options
-        ``limits`` and ``slew`` of `Learning`; they hold for each axis.
-    """
-    if isinstance(model, StageModel):
-        return {'y': Learning(model, wanted['y'], **options)}
-    model.require_chains('learn')
-    drive = invert(model, wanted, clip=True, **options)
-    moved = {motion_of(a): model.own(a).simulate(x.v)[x.lead :] for a, x in drive.items()}
-    return {
-        axis: Learning(x, y, clip=not np.ptp(y), channels=moved, **options)
-        for axis, x in model.axes.items()
-        for y in [wanted[axis]]
-    }
 
 
 def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Array]:

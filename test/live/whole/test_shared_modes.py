@@ -9,6 +9,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.live.tracker import prepared, Tracker
 from piezo_ident.model.modes.stream import ModesRun, ModesStream
@@ -16,7 +17,6 @@ from piezo_ident.model.multi_axis import alone, SHARED_MODES
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import KEY, PredictionBand
-from piezo_ident.verbs.invert import learn_axes
 from piezo_ident.verbs.predict import bands
 import pytest
 from random_models import random_modes_model, random_voltages
@@ -169,16 +169,13 @@ def test_the_observer_corrects_the_prediction_of_each_axis():
         assert np.abs(left).max() < 0.1 * abs(moved[k, 0])
 
 
-def test_what_runs_chains_alone_refuses_shared_modes():
-    model, _ = case(14)
-    one, settings = case(14, 1)[0], GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
-    for verb, act in {
-        'feedforward of one axis': lambda: prepared(one, AXES[:1], settings, 9, 'off', None),
-        'learn': lambda: learn_axes(model, {a: np.zeros(9) for a in AXES[:2]}),
-    }.items():
-        with pytest.raises(pi.ModelError, match=f'^{verb}: cannot run the modes') as caught:
-            act()
-        assert 'MultiAxisModel(model.axes)' in str(caught.value)
+def test_the_feedforward_of_one_axis_refuses_shared_modes():
+    model, settings = case(14, 1)[0], GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
+    with pytest.raises(
+        pi.ModelError, match=r'^feedforward of one axis: cannot run the modes'
+    ) as no:
+        prepared(model, AXES[:1], settings, 9, 'off', None)
+    assert 'MultiAxisModel(model.axes)' in str(no.value)
 
 
 LIMITS = GuardSettings(-1.0, 11.0, 40e3, 200.0, 0.0, RATE)
@@ -283,3 +280,67 @@ def test_a_coupled_axis_with_another_gain_is_followed():
 def test_a_model_of_another_rate_has_no_tracker():
     with pytest.raises(pi.ModelError, match='sampled at 10000 Hz'):
         Tracker(scanner()[0], replace(LIMITS, sample_rate=1e4), axes=AXES[:2])
+
+
+def repeated(model, stage, wanted, most=6):
+    """Repeat motions on a stage; return the learning, each voltage, and errors by axis [%]."""
+    learning, sent, errors = LiveLearning(model, wanted, LIMITS, AXES[:2]), [], []
+    spans = np.where(np.ptp(wanted, axis=1), np.ptp(wanted, axis=1), 1.0)
+    while not learning.is_done and len(learning.errors) < most:
+        tracker, run = Tracker(model, LIMITS, 400, axes=AXES[:2]), ModesRun(stage.modes, AXES[:2])
+        t, v = tracker.play(learning.voltage)
+        y = run.process(v)
+        for k, row in enumerate(y):
+            learning.measured(Samples(t, row), 0, k)
+        assert learning.is_complete
+        learning.take()
+        sent.append(v)
+        error = y[:, -wanted.shape[1] :] - wanted
+        errors.append(100.0 * np.sqrt(np.mean(error**2, axis=1)) / spans)
+    return learning, sent, np.stack(errors)
+
+
+def test_motions_of_coupled_axes_are_learnt():
+    model, stage = scanner(1.03)
+    # plays that the model lacks in part
+    modes = replace(stage.modes, mu=1.2 * stage.modes.mu)
+    wanted = scans(model, 6000)
+    learning, v, errors = repeated(model, pi.MultiAxisModel(model.axes, modes), wanted)
+    assert (errors[0] > 1.0).all() and (errors.min(axis=0) < 0.05).all()
+    np.testing.assert_allclose(
+        [r.error for r in learning.each['y_b'].repetitions], errors[:, 1], rtol=1e-6
+    )
+    for one in v:
+        assert one.min() >= LIMITS.low and one.max() <= LIMITS.high
+        assert np.abs(np.diff(one, axis=1)).max() <= LIMITS.step * (1 + 1e-9)
+    # each drive moves the other axis, too: both have a part in the next drives
+    drives = [one.drive for one in learning.each.values()]
+    assert drives[0].lead == drives[1].lead and drives[0].v.size == drives[1].v.size
+
+
+def test_a_coupled_axis_that_stands_still_is_no_obstacle_to_learning():
+    model, stage = scanner(1.03)
+    wanted = scans(model, 4000)
+    wanted[0] = model.modes.y0[0]
+    _, _, errors = repeated(model, stage, wanted)
+    assert errors[0, 1] > 0.5 and errors[:, 1].min() < 0.05
+    wanted[1] += 3e-5
+    with pytest.raises(pi.DataError, match='of y_b are out of reach'):
+        LiveLearning(model, wanted, LIMITS, AXES[:2])
+
+
+def test_a_sensor_at_fault_ends_learning_with_the_name_of_its_axis():
+    model, _ = scanner()
+    learning = LiveLearning(model, scans(model, 3000), LIMITS, AXES[:2])
+    for broken in (True, False):
+        t = np.arange(learning.voltage.shape[1]) / RATE
+        y = offline(model, learning.voltage, AXES[:2])
+        for k, row in enumerate(y):
+            learning.measured(Samples(t, np.zeros(t.size) if broken and k else row), 0, k)
+        if broken:
+            with pytest.raises(pi.DataError, match='y_b: learning: the displacement stands'):
+                learning.take()
+        else:
+            # it goes on with what was sound
+            learning.take()
+            assert learning.errors[0] < 0.5
