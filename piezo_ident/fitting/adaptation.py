@@ -7,7 +7,8 @@ Learn the gain of a running stage slowly, and on request its hysteresis.
 The learnt displacement is the free run plus a sum of terms theta_j f_j.  Each f_j is the response
 to one change of the model.  The model may change its gain, the weights of its plays (by hats over
 their thresholds), its cubic, or the gains of its creep.  A changed model runs for each f_j, so
-amplifier, creep, G and delay act on the change as they act on the stage.  A high-pass removes
+amplifier, creep, G and delay act on the change as they act on the stage.  If modes that axes share
+predict, the gain alone is learnt, and f is the free run about the zero.  A high-pass removes
 offset, drift and creep of earlier motion from the f_j and from the measured error; the observer
 corrects these.
 
@@ -35,6 +36,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ModelError
 from piezo_ident.effects.creep import Creep
 from piezo_ident.fitting import adaptation_kernel as kernel
 from piezo_ident.model.metrics import expected_error
@@ -45,8 +47,9 @@ from piezo_ident.operators.hysteresis import Hysteresis
 
 #: learnt part of the model
 Learns = Literal['off', 'gain', 'hysteresis']
-#: turns a model into a run that has seen the voltage so far
-Recalled: TypeAlias = Callable[[StageModel], Stream]
+#: turns a model into a run that has seen the voltage so far; None if modes that axes share predict
+#: instead of the model, which then has scaling and known errors alone
+Recalled: TypeAlias = Callable[[StageModel], Stream] | None
 
 #: time over which samples are averaged to one measurement [s]
 GROUP = 2e-3
@@ -121,6 +124,15 @@ def _creeping(model: StageModel, times: float) -> StageModel:
     return replace(model, effects=tuple(effects))
 
 
+def check_learns(kind: Learns, shares: bool) -> None:
+    """Refuse hysteresis of modes that axes share with a ModelError."""
+    if shares and kind == 'hysteresis':
+        raise ModelError(
+            'adapt: the hysteresis of modes that the axes share is not learnt, because each play '
+            'moves all axes and an axis learns from its own displacement; learn the gain'
+        )
+
+
 class Adaptation:
     """
     Learns changes of a model from displacement that comes a horizon later.
@@ -135,7 +147,7 @@ class Adaptation:
     horizon : int, optional
         Samples by which displacement is older than the free run that it corrects.
     recalled : callable, optional
-        Turns a model into a run that has seen the voltage so far; at rest when absent.
+        See `Recalled`; at rest when absent.
     """
 
     def __init__(
@@ -145,6 +157,7 @@ class Adaptation:
         horizon: int = HORIZON,
         recalled: Recalled = StageModel.stream,
     ) -> None:
+        check_learns(kind, recalled is None)
         self.model, self.kind, self.horizon = model, kind, horizon
         percent = expected_error(model)
         held = UNKNOWN if percent is None else percent / 100.0
@@ -189,7 +202,7 @@ class Adaptation:
     def begin(self, recalled: Recalled = StageModel.stream) -> None:
         """Begin another run with the learnt changes."""
         n = len(self._changes) + 1
-        self._runs = [recalled(change.model) for change in self._changes]
+        self._runs = None if recalled is None else [recalled(x.model) for x in self._changes]
         self._past = np.full((n, self.horizon), np.nan)
         self._slow, self._sums = np.full(n, np.nan), np.zeros(n)
         self._now[[kernel.COUNT, kernel.FINITE, kernel.REFUSED, kernel.PIVOT]] = 0.0
@@ -270,6 +283,8 @@ class Adaptation:
     def responses(self, v: Array, t: Array, free: Array) -> Array:
         """Run each changed model; return the free run and the responses to unit changes."""
         s = self.model.scaling
+        if self._runs is None:
+            return np.stack([s.x(free)] * 2)
         return np.stack([s.x(free), *[(run.process(v, t) - free) / s.Y for run in self._runs]])
 
     def learn(self, y: Array, before: Array, new: Array) -> Array:

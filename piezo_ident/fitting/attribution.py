@@ -107,7 +107,7 @@ class Attribution:
     horizon : int
         Samples by which displacement is older than the free run.
     recalled : callable, optional
-        Turns a model into a run that has seen the voltage so far; at rest when absent.
+        See `Recalled`; at rest when absent.  None leaves the gain and the delay alone.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Attribution:
         changed = (wider if h.weights.any() else None, slower(model))
         self._model, self._rate = model, model.sample_rate
         self._error = (expected_error(model) or 0.0) / 100.0
-        self._runs = [None if m is None else recalled(m) for m in changed]
+        self._runs = [None if m is None or recalled is None else recalled(m) for m in changed]
         self._past = np.full((3, horizon), np.nan)
         self._batch: list[tuple[Array, Array, Array, Array]] = []
         # state of the high-pass

@@ -125,6 +125,8 @@ class Corrector:
         self._adaptation: Adaptation | None = None
         self._attribution: Attribution | None = None
         self._is_new = False
+        # makes the runs of a stream that starts over
+        self._at_rest: Recalled = StageModel.stream
         self.told: dict[str, float] = {}
         self._bin = -1
         self._forget()
@@ -142,11 +144,7 @@ class Corrector:
         return abs(self._model.scaling.Y) if self._model is not None else np.inf
 
     def set_model(self, model: StageModel, recalled: Recalled = StageModel.stream) -> None:
-        """
-        Take the model that predicts from now on.
-
-        `recalled` turns a model into a run that has seen the voltage so far; at rest when absent.
-        """
+        """Take the model that predicts from now on; at rest when `recalled` is absent."""
         self._model = model
         self._learn_anew(recalled)
 
@@ -164,6 +162,7 @@ class Corrector:
 
     def _learn_anew(self, recalled: Recalled) -> None:
         self._adaptation, self._is_new = None, True
+        self._at_rest = None if recalled is None else StageModel.stream
         if self._model is not None:
             self._attribution = Attribution(self._model, self._horizon, recalled)
             if self._adapt != 'off':
@@ -265,9 +264,9 @@ class Corrector:
             if model.is_static:
                 model = replace(model, sample_rate=1.0 / period)
             if not self._is_new:
-                self._attribution = Attribution(model, self._horizon)
+                self._attribution = Attribution(model, self._horizon, self._at_rest)
                 if self._adaptation is not None:
-                    self._adaptation.begin()
+                    self._adaptation.begin(self._at_rest)
             self._is_new = False
             self._observer = Observer(
                 model, horizon=self._horizon, known=known, gain=self._gain, drift=self._drift

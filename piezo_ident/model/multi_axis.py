@@ -300,6 +300,11 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     return {'y': model} if isinstance(model, StageModel) else model.axes
 
 
+def shares_modes(model: StageModel | MultiAxisModel | None) -> bool:
+    """Return whether modes that the axes share predict."""
+    return isinstance(model, MultiAxisModel) and model.modes is not None
+
+
 def require_voltages_only(model: StageModel | MultiAxisModel) -> None:
     """Refuse a model with an effect that needs a measured channel, with a ModelError."""
     several = isinstance(model, MultiAxisModel)
@@ -327,8 +332,7 @@ def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 
 def judged_models(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """List the model of each axis with the known errors and the band of its prediction."""
-    shares = isinstance(model, MultiAxisModel) and model.modes is not None
-    return alone(model) if shares else models_of(model)
+    return alone(model) if shares_modes(model) else models_of(model)
 
 
 def _beside_modes(model: StageModel) -> StageModel:
@@ -340,12 +344,33 @@ def _beside_modes(model: StageModel) -> StageModel:
 def with_own(
     model: StageModel | MultiAxisModel, own: Mapping[str, StageModel]
 ) -> StageModel | MultiAxisModel:
-    """Replace the models of `alone`, which keep their effects; the paths stay as they are."""
+    """
+    Replace the models of `alone`, which keep their effects; the paths stay as they are.
+
+    Shared modes take the gain that was learnt last of each axis, about the zero of its scaling.
+    """
     if isinstance(model, StageModel):
         return own['y']
+    if model.modes is not None:
+        return _with_gains(model, model.modes, own)
     axes = {}
     for axis, x in model.axes.items():
         effects = iter(own[axis].effects)
         kept = tuple(e if e.channel.startswith(MOTION) else next(effects) for e in x.effects)
         axes[axis] = replace(own[axis], effects=kept)
     return replace(model, axes=axes)
+
+
+def _with_gains(
+    model: MultiAxisModel, modes: SharedModes, own: Mapping[str, StageModel]
+) -> MultiAxisModel:
+    axes = {
+        axis: replace(
+            x, identification={**x.identification, SHARED_MODES: own[axis].identification}
+        )
+        for axis, x in model.axes.items()
+    }
+    order = [own[axis] for axis in sorted(own)]
+    learnt = [x.identification['adaptation'][-1]['gain']['value'] for x in order]
+    zeros = np.array([x.scaling.y0 for x in order])
+    return MultiAxisModel(axes, modes.grown(np.array(learnt), zeros))

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.fitting.adaptation import Recalled
+from piezo_ident.fitting.adaptation import check_learns, Recalled
 from piezo_ident.live.comparison import AxisComparison, finite_readings
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.join import Join
 from piezo_ident.live.monitor import Preview, PreviewBin
 from piezo_ident.live.pacing import Looks
 from piezo_ident.live.predictor import Predictor, run_of, warm_up
-from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel, with_own
+from piezo_ident.model.multi_axis import alone, models_of, shares_modes, with_own
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
 from piezo_ident.nodes.parameter_node import home_problem
@@ -95,16 +95,12 @@ class ModelNode(LabNode):
         on_message = functools.partial(self._on_block, what, tail)
         return self.create_subscription(Float64MultiArray, f'{what}{tail}', on_message, STREAM)
 
-    def _check_adaptation(self, adapt: str, model: Model | None) -> None:
-        if isinstance(model, MultiAxisModel) and adapt != 'off':
-            model.require_chains('adapt')
-
     # models
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a missing model file; ``~/status`` reports faults inside a file."""
         if name == 'adapt' and hasattr(self, '_predictor'):
-            self._check_adaptation(value, self._predictor.model)
+            check_learns(value, shares_modes(self._predictor.model))
         return {'model': no_file, 'output': home_problem}.get(name, lambda _: None)(value)
 
     def apply(self, changed: Mapping[str, Any]) -> None:
@@ -122,12 +118,14 @@ class ModelNode(LabNode):
                 one.left.clear()
 
     def _recalled(self, axis: int) -> Recalled:
+        if shares_modes(self._predictor.model):
+            return None
         return functools.partial(self._predictor.caught_up, axis=axis)
 
     def _take_model(self, model: Model | None, source: str) -> None:
         try:
             if model is not None:
-                self._check_adaptation(self.values['adapt'], model)
+                check_learns(self.values['adapt'], shares_modes(model))
                 self._predictor.set_model(model)
                 for k, (tail, one) in enumerate(self._comparisons.items()):
                     one.set_model(alone(model)[f'y{tail}'], self._recalled(k))

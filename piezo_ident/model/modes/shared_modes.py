@@ -31,7 +31,7 @@ motion.  With F = 0 the plays lie in front of the mechanics.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 import math
 from typing import Any
 
@@ -109,6 +109,14 @@ class SharedModes:
     def signals(self) -> int:
         """Number of signals z."""
         return len(self.f)
+
+    def grown(self, shares: Array, zeros: Array) -> SharedModes:
+        """Increase the gain of each output by a share, about zeros [m]."""
+        by = 1.0 + shares
+        linear = replace(self.linear, c=by[:, None] * self.linear.c, d=by[:, None] * self.linear.d)
+        return replace(
+            self, linear=linear, h=by[:, None] * self.h, y0=zeros + by * (self.y0 - zeros)
+        )
 
     @property
     def loop(self) -> Loop:

@@ -13,7 +13,7 @@ from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.predictor import Predictor
 from piezo_ident.live.tracker import prepared, Tracker
 from piezo_ident.model.modes.stream import ModesRun, ModesStream
-from piezo_ident.model.multi_axis import alone, SHARED_MODES
+from piezo_ident.model.multi_axis import alone, SHARED_MODES, with_own
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import KEY, PredictionBand
@@ -344,3 +344,51 @@ def test_a_sensor_at_fault_ends_learning_with_the_name_of_its_axis():
             # it goes on with what was sound
             learning.take()
             assert learning.errors[0] < 0.5
+
+
+def adapted(model, stage, v, correctors, start=0):
+    """Play voltages to a stage, and its motion to the correctors; return the estimates."""
+    predictor, y, got = Predictor(AXES[:2]), offline(stage, v, AXES[:2]), [[], []]
+    predictor.set_model(model)
+    for cut in (slice(i, i + 100) for i in range(0, v.shape[1], 100)):
+        t = np.arange(start, start + v.shape[1])[cut] / RATE
+        rows = predictor.process(Samples(t, v[:, cut])).values
+        for k, one in enumerate(correctors):
+            both = Samples(t, rows[k]), Samples(t, v[k, cut])
+            got[k] += one.predicted(*both, True, predictor.felt[k])
+            got[k] += one.measured(t, y[k, cut])
+    estimates = [np.concatenate([one.samples.values for one in rows]) for rows in got]
+    return [x - row[: x.size] for x, row in zip(estimates, y, strict=True)]
+
+
+def test_the_gain_of_each_coupled_axis_is_learnt(tmp_path):
+    model, stage = scanner(1.03)
+    v = tracked(model, model, scans(model, 60_000))[1]
+    correctors = [Corrector(adapt='gain') for _ in AXES[:2]]
+    for one, axis in zip(correctors, AXES, strict=False):
+        one.set_model(alone(model)[axis], None)
+    misses = adapted(model, stage, v, correctors)
+    gains = [one.told['learnt/gain'] for one in correctors]
+    assert gains == pytest.approx([0.0, 0.03], abs=1e-3)
+    spans = [abs(x.scaling.Y) for x in model.axes.values()]
+    late = [np.std(x[x.size // 2 :]) / span for x, span in zip(misses, spans, strict=True)]
+    assert max(late) < 2e-4
+    # a stream that starts over keeps what was learnt
+    again = adapted(model, stage, v[:, :20_000], correctors, start=-40_000)
+    assert np.std(again[1]) < 1e-3 * spans[1]
+    assert correctors[1].told['learnt/gain'] == pytest.approx(0.03, abs=1e-3)
+    # the saved model has the gain of the stage
+    learnt = {a: one.learnt for a, one in zip(AXES, correctors, strict=False)}
+    with_own(model, learnt).save(tmp_path / 'learnt.yaml')
+    saved = pi.load(tmp_path / 'learnt.yaml')
+    other = v[:, 20_000:30_000]
+    miss = offline(saved, other, AXES[:2]) - offline(stage, other, AXES[:2])
+    assert np.abs(miss).max() < 1e-3 * max(spans)
+    known = saved.axes['y_b'].identification[SHARED_MODES]
+    assert known['adaptation'][0]['adapt'] == 'gain' and 'diagnosis' in known
+    assert list(saved.axes['y_b'].effects) == list(model.axes['y_b'].effects)
+
+
+def test_the_hysteresis_of_shared_modes_is_not_learnt():
+    with pytest.raises(pi.ModelError, match='an axis learns from its own displacement'):
+        Corrector(adapt='hysteresis').set_model(alone(scanner()[0])['y'], None)

@@ -111,8 +111,9 @@ def test_the_live_prediction_is_the_free_run(lab, identified, shares_modes):
     assert lab.set('model', 'model', str(path))[0]
     lab.wait(lambda: path.name in lab.status('model')['text'], 'the model')
     if shares_modes:
-        ok, reason = lab.set('model', 'adapt', 'gain')
-        assert not ok and 'adapt: cannot run the modes' in reason
+        ok, reason = lab.set('model', 'adapt', 'hysteresis')
+        assert not ok and 'adapt: the hysteresis of modes' in reason
+        assert lab.set('model', 'adapt', 'gain')[0]
     lab.wait(lambda: lab.status('model')['state'] == 'predicting', 'a model')
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
     # of the paths there are none yet; the last figures of a path are of the test of `AxesRun`
@@ -145,6 +146,12 @@ def test_the_live_prediction_is_the_free_run(lab, identified, shares_modes):
     assert not np.array_equal(whole['voltage'], whole['voltage_b'])
     lab.wait(lambda: heard['residual_b'] and heard['estimate_b'], 'residual and estimate')
     lab.wait(lambda: 'residual_percent_b' in lab.diagnostics('model'), 'the error of the axis')
+    if shares_modes:
+        learnt = identified[1] / 'learnt.yaml'
+        assert lab.set('model', 'output', str(learnt))[0]
+        assert lab.call('model/save')[0]
+        assert pi.load(learnt).modes is not None
+        assert lab.set('model', 'adapt', 'off')[0]
 
 
 def test_a_model_of_other_axes_is_refused(lab, identified):
