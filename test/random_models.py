@@ -162,6 +162,25 @@ def random_modes_model(rng: np.random.Generator, axes: int = 2, **options) -> Mu
     return MultiAxisModel({a: replace(PAPER, scaling=scaling) for a in names}, modes)
 
 
+def brittle_modes(model: MultiAxisModel) -> MultiAxisModel:
+    """Return a model of two axes, 2 um/V about 3 V, whose modes run away above 10 V."""
+    half = 0.5 * np.eye(2)
+    linear = Modal(half[None], half, 2e-6 * np.eye(2), np.zeros((2, 2)))
+    modes = replace(
+        SharedModes.of(linear),
+        e=np.eye(2),
+        h=np.zeros((2, 2)),
+        f=np.eye(2),
+        g=np.zeros((2, 2)),
+        # beyond the threshold the gain of the loop is 1.2
+        mu=np.full((2, 1), 0.7),
+        r=np.array([7.0]),
+        v0=np.full(2, 3.0),
+        y0=np.full(2, 1e-5),
+    )
+    return MultiAxisModel(model.axes, modes)
+
+
 def random_voltages(rng: np.random.Generator, modes: SharedModes, n: int, size: float = 3.0):
     """Return smooth voltages about those of the fit, shape (n, axes)."""
     steps = rng.normal(size=(n, len(modes.v0)))

@@ -19,7 +19,7 @@ from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import KEY, PredictionBand
 from piezo_ident.verbs.predict import bands
 import pytest
-from random_models import random_modes_model, random_voltages
+from random_models import brittle_modes, random_modes_model, random_voltages
 
 RATE = 20e3
 AXES = ('y', 'y_b', 'y_c')
@@ -392,3 +392,17 @@ def test_the_gain_of_each_coupled_axis_is_learnt(tmp_path):
 def test_the_hysteresis_of_shared_modes_is_not_learnt():
     with pytest.raises(pi.ModelError, match='an axis learns from its own displacement'):
         Corrector(adapt='hysteresis').set_model(alone(scanner()[0])['y'], None)
+
+
+@pytest.mark.parametrize('follow', ['off', 'gain'])
+def test_modes_that_run_away_end_the_drive_and_the_ramp_goes_on(follow):
+    model = brittle_modes(random_modes_model(np.random.default_rng(0)))
+    tracker, y0 = Tracker(model, LIMITS, 400, follow, AXES[:2]), model.modes.y0[:, None]
+    tracker.process(np.repeat(y0, 4000, axis=1), restarted=True)
+    top = y0 + np.array([[1e-4], [0.0]])
+    with pytest.raises(pi.ModelError, match='run away'):
+        tracker.process(np.repeat(top, 4000, axis=1))
+    # what was played shows the followers the same
+    tracker.play(np.full((2, 9000), 11.0))
+    while not tracker.is_at_rest:
+        assert tracker.idle(1000)[1].shape == (2, 1000)

@@ -17,7 +17,7 @@ from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.record.blocks import Samples
 from programs import identification_program
 import pytest
-from random_models import random_shared_modes
+from random_models import brittle_modes, random_shared_modes
 
 RATE = 2000.0
 #: what every axis plays alone
@@ -217,6 +217,28 @@ def test_both_axes_follow_their_references(lab, identified, shares_modes):
     assert lab.status('feedforward')['models'] in ('1', '2')
     assert lab.call('feedforward/start')[0]
     lab.wait(lambda: lab.status('feedforward')['models'] == '2', 'the model of the topic')
+    lab.handle('feedforward').stop()
+    for topic in ('reference', 'reference_b'):
+        lab.unpublish(topic)
+
+
+def test_modes_that_run_away_end_the_drive_at_rest(lab, identified):
+    path, sent = identified[1] / 'brittle.yaml', lab.collect('voltage')
+    brittle_modes(pi.load(identified[1] / 'model.yaml')).save(path)
+    limits = {'voltage_high': 11.0, 'slew': 1000.0, 'ramp_slew': 200.0}
+    lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), **limits})
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
+    seen = len(lab.statuses('feedforward'))
+    assert lab.call('feedforward/start')[0]
+    lab.until('feedforward', 'ready', since=seen)
+    t = np.arange(2000) / RATE
+    for k in range(0, t.size, 100):
+        cut = slice(k, k + 100)
+        for tail in ('', '_b'):
+            x = 1e-5 + 2e-5 * t[cut]
+            lab.publish(f'reference{tail}', Samples(t[cut], x, 'scan', f'reference{tail}'))
+    assert 'run away' in lab.until('feedforward', 'failed', since=seen)['text']
+    lab.wait(lambda: sent[-1].values[-1] == 0.0, 'rest')
     lab.handle('feedforward').stop()
     for topic in ('reference', 'reference_b'):
         lab.unpublish(topic)
