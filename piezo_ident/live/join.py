@@ -18,6 +18,9 @@ from piezo_ident.record.blocks import Samples, SHORTEST
 
 #: most samples that are kept
 MOST = 1_000_000
+#: time for which an axis is not silent after a block of it [s]: the middleware may tell of a
+#: publisher later than it brings its first block (taste)
+HEARD = 1.0
 
 
 def held(x: Array, before: float) -> Array:
@@ -108,7 +111,7 @@ class Join:
     >>> [*join.complete(is_over=lambda since: False)]
     []
     >>> join.add('_b', Samples(t, np.array([3.0, 4.0])), since=0.0)
-    >>> ((samples, _),) = join.complete(is_over=lambda since: False)
+    >>> ((samples, *_),) = join.complete(is_over=lambda since: False)
     >>> join.rows(samples)[0].values.tolist()
     [[1.0, 2.0], [3.0, 4.0]]
     """
@@ -121,6 +124,7 @@ class Join:
     ) -> None:
         self._companions = {tail: Companion(sample_rate) for tail in tails}
         self._last = {**dict.fromkeys(tails, 0.0), **dict(zip(tails, rest, strict=False))}
+        self._heard = dict.fromkeys(tails, -math.inf)
         # blocks with a note of the caller, and their arrival
         self._waiting: deque[tuple[Samples, Any, float]] = deque()
 
@@ -128,28 +132,30 @@ class Join:
         """Take a block of an axis, which came at a time `since` [s]; '' is the first axis."""
         if tail:
             self._companions[tail].add(samples)
+            self._heard[tail] = since
         else:
             self._waiting.append((samples, note, since))
 
     def complete(
         self, is_over: Callable[[float], bool], silent: Collection[str] = ()
-    ) -> Iterator[tuple[Samples, Any]]:
+    ) -> Iterator[tuple[Samples, Any, Collection[str]]]:
         """
-        Yield the blocks of the first axis whose partners have come, each with its note.
+        Yield the blocks of the first axis whose partners have come, with note and silent axes.
 
         `is_over` says whether the wait of a block that came at a time [s] is over.  No block waits
-        for a `silent` axis: no node publishes its topics.
+        for a `silent` axis, whose topic no node publishes, unless it was heard lately.
         """
         while self._waiting:
             samples, note, since = self._waiting[0]
+            quiet = {tail for tail in silent if since - self._heard[tail] > HEARD}
             lacking = any(
-                tail not in silent and not companion.has(samples.t)
+                tail not in quiet and not companion.has(samples.t)
                 for tail, companion in self._companions.items()
             )
             if lacking and not is_over(since):
                 return
             self._waiting.popleft()
-            yield samples, note
+            yield samples, note, quiet
 
     def take(self, tail: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Remove and return the samples of a further axis; NaN stands for a missing sample."""

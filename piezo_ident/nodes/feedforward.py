@@ -39,7 +39,7 @@ Without displacement the node drives on, warns, and has no tracking error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 import time
 from typing import Any
@@ -241,12 +241,12 @@ class FeedforwardNode(DrivingNode):
         heard = self._references.items()
         # nobody wants these axes to move
         resting = [tail for tail, x in heard if tail and not x.get_publisher_count()]
-        for samples, sequence in self._wanted.join.complete(
+        for block in self._wanted.join.complete(
             lambda since: self._looks.is_over(since, PATIENCE), resting
         ):
-            self._take(samples, sequence, resting)
+            self._take(*block)
 
-    def _take(self, samples: Samples, sequence: int | None, resting: list[str]) -> None:
+    def _take(self, samples: Samples, sequence: int | None, resting: Collection[str]) -> None:
         verdict = self._sample_clock.judge(
             samples, sequence, lambda: publisher_ids(self, self._references[''])
         )

@@ -191,7 +191,7 @@ class ModelNode(LabNode):
     def _take_complete(self) -> None:
         """Take the blocks of voltage whose further axes have come or are overdue."""
         silent = [t for t in self._tails[1:] if not self._voltages[t].get_publisher_count()]
-        for first, _ in self._join.complete(
+        for first, *_ in self._join.complete(
             lambda since: self._looks.is_over(since, PATIENCE), silent
         ):
             samples, missing = self._join.rows(first)

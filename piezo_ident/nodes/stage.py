@@ -202,7 +202,7 @@ class StageNode(LabNode):
         """Process the blocks whose further voltages have come or are overdue."""
         patience = min(PATIENCE, self.values['silence'] / 2)
         silent = [tail for tail, x in self._further.items() if not x.get_publisher_count()]
-        for samples, sequence in self._join.complete(
+        for samples, sequence, _ in self._join.complete(
             lambda since: self._looks.is_over(since, patience), silent
         ):
             self._take(samples, sequence)

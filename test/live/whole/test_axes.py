@@ -81,7 +81,7 @@ def test_voltages_are_joined_on_their_time():
     said = []
 
     def take(is_over=False, silent=()):
-        for block, note in join.complete(lambda since: is_over, silent):
+        for block, note, _ in join.complete(lambda since: is_over, silent):
             rows, missing = join.rows(block)
             said.append((note, rows.values[1].tolist(), missing))
 
@@ -97,8 +97,15 @@ def test_voltages_are_joined_on_their_time():
     assert said == []
     take(is_over=True)
     assert said.pop() == ('b', [second[0].values[-1]] * 70, {'_b': 70})
+    # who was heard lately has not gone, whatever is known of publishers
+    join.add('', first[2], 0.5, 'c')
+    take(silent=['_b'])
+    assert said == []
+    join.add('_b', second[2], 0.6)
+    take(silent=['_b'])
+    assert said.pop() == ('c', second[2].values.tolist(), {})
     # an axis that nobody drives is not waited for
-    join.add('', first[2], 0.0, 'c')
+    join.add('', first[3], 2.0, 'd')
     take(silent=['_b'])
     assert said.pop()[2] == {'_b': 70}
 
