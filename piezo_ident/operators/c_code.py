@@ -4,9 +4,9 @@
 """
 Operators as C code, from which `piezo_ident.export` makes a header.
 
-The C statements of an operator process one sample with the numbers of the Python loop.  The loops
-of `piezo_ident.operators.kernels` keep their order of operations here, except in sums.  The order
-of a sum only changes the last digit: a G that would amplify the change runs as sections.
+The C statements of an operator process one sample, with the numbers of the Python loop.  They keep
+the order of operations of `piezo_ident.operators.kernels`, except in sums.  The order of a sum
+changes the last digit only, because a G that would amplify this change runs as sections.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def hysteresis_in_c(h: Hysteresis) -> CCode:
     has_lags = h.relaxations is not None and len(h.relaxations) > 0
     if h.relaxations is not None and has_lags:
         n = len(h.relaxations)
-        # these names differ from the names of the curves
+        # d1 .. d3, because c1 .. c3 are the curves
         rows = zip(('rate', 'd1', 'd2', 'd3'), h.relaxations.T, strict=True)
         numbers |= {'n': n, 'lines': path_lines(np.array(h.relaxations)).ravel(), **dict(rows)}
     return read_c(

@@ -136,8 +136,8 @@ class Dynamics:
             zeros = np.delete(zeros, real[np.argmin(np.abs(zeros[real] - pole))])
         a = np.atleast_1d(np.real(np.poly(poles[~slow])))[1:]
         faster = Dynamics(a=a, b=np.atleast_1d(np.real(np.poly(zeros))))
-        one, other = (g.response([10.0 * slowest], sample_rate)[0] for g in (self, faster))
-        gain = abs(one) / abs(other) * np.sign(np.real(one / other))
+        before, after = (g.response([10.0 * slowest], sample_rate)[0] for g in (self, faster))
+        gain = abs(before) / abs(after) * np.sign(np.real(before / after))
         return Dynamics(a=faster.a, b=faster.b * float(gain))
 
     def response(self, frequency: ArrayLike, sample_rate: float) -> NDArray[np.complex128]:
@@ -172,7 +172,7 @@ class Dynamics:
 
 
 def filter_arx(a: Array, b: Array, x: Array, at_rest: bool = True) -> Array:
-    """Filter x by B(z)/A(z), shape (n,); `at_rest`, from equilibrium with its first sample."""
+    """Filter x by B(z)/A(z), shape (n,), from equilibrium with its first sample or from zero."""
     past_w, past_y = b.size - 1, a.size
     w, y = np.empty(past_w + x.size), np.empty(past_y + x.size)
     w[past_w:] = x

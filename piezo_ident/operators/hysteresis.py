@@ -10,14 +10,14 @@ of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised unit
 
     p0 v^2 + sum_i (c_i1 t_i^2 + c_i2 t_i^3 + c_i3 t_i^4) + sum_i kappa_i (v - low) (F_ri[v] - low)
 
-with ``t_i = F_ri[v] - low``, held between 0 and ``high - low - r_i``.  Functions of the play
-outputs make a Preisach operator.  Its density at threshold and place (r, F) is their derivative:
-Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
+with ``t_i = F_ri[v] - low``, held between 0 and ``high - low - r_i``.  A sum of functions of play
+outputs is a Preisach operator.  Its density over threshold and output is the derivative of these
+functions: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
 doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are not a Preisach operator.
-In all these cases the memory consists of the play outputs.
+All of these terms have the play outputs as their memory.
 
-A semilinear Duhem model forgets along the path that the voltage travels, at any speed, and has no
-return points: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and cubic phi_j.
+A semilinear Duhem model forgets along the path of the voltage, at any speed.  It has no return
+point memory: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and cubic phi_j.
 J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
 rate-dependent hysteresis", IEEE Trans. Automatic Control 50(5), 2005,
 doi:10.1109/TAC.2005.847035; Bouc-Wen and Coleman-Hodgdon loops are of this kind.
@@ -358,20 +358,20 @@ class HysteresisOperator:
 
     def __init__(self, hysteresis: Hysteresis, memory: ArrayLike | None = None) -> None:
         self.hysteresis = hysteresis
-        self._given = None if memory is None else np.array(memory, np.float64)
+        self._start = None if memory is None else np.array(memory, np.float64)
         m, k = hysteresis.thresholds.size, hysteresis.lag_range.shape[1]
         sizes = {m, m + k, m + k + 1} if k else {m}
-        if self._given is not None and (self._given.ndim != 1 or self._given.size not in sizes):
+        if self._start is not None and (self._start.ndim != 1 or self._start.size not in sizes):
             also = f', and behind them the value of each of {k} lags' if k else ''
             raise ModelError(
-                f'hysteresis: {self._given.size} play outputs at the start for {m} thresholds; '
+                f'hysteresis: {self._start.size} play outputs at the start for {m} thresholds; '
                 f'give one each{also}'
             )
         self.memory = hysteresis.initial_memory(0.0)
 
     def reset(self, v0: float, x0: float) -> float:
-        """Take the given memory, or the memory of a stage that last came down to zero."""
-        start = self.hysteresis.initial_memory(x0) if self._given is None else self._given
+        """Take the memory of the constructor, or of a stage that last came down to zero."""
+        start = self.hysteresis.initial_memory(x0) if self._start is None else self._start
         w, self.memory = self.hysteresis.follow(np.array([x0]), start)
         return float(w[0])
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Families (laws) of H that are linear in their coefficients, for given thresholds.
+Families (laws) of H that are linear in their coefficients, for fixed thresholds.
 
 - ``plays``: q_i F_i, v^3 and v, the law of the paper, eqs. (3) and (6).
 - ``square``: plays, and v^2.
@@ -90,11 +90,10 @@ class HysteresisLaw:
 
     def roughness(self, density: float, change: float) -> Array:
         """
-        Compute rows that measure the densities and their change with the place of a play.
+        Compute rows whose products with the coefficients measure how rough H is; shape (k, size).
 
-        The shape is (k, size).  The product of a row and the coefficients is one for a play of the
-        density `density`, or for a density `change` that depends on the place.  It is also one for
-        a difference `change` of neighbouring coefficients of a polynomial.
+        A product is one for a play of the density `density`, for a density `change` that depends
+        on the play output, and for a step `change` between two coefficients of one polynomial.
         """
         m, n = self.thresholds.size, self.densities
         size = np.eye(n, self.size) / change
@@ -164,7 +163,7 @@ class HysteresisLaw:
     def _of(
         self, row: Array, has_curves: bool, has_bias: bool, plays: Mask | None = None
     ) -> Hysteresis:
-        """Make the H of a row of parameters; given `plays`, without its other plays and lags."""
+        """Make the H of a row of parameters; `plays` drops other plays, and lags of zero."""
         n = (POWERS + 2) * self.thresholds.size
         x, (p0, p1, p2) = row[:n].reshape(POWERS + 2, -1), row[n : n + 3].tolist()
         lags = row[n + 3 :].reshape(-1, 3)
@@ -187,7 +186,7 @@ class HysteresisLaw:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def parts(self, places: Sequence[int]) -> Iterator[tuple[Hysteresis, Mask]]:
-        """Yield for each given coefficient its H alone, and a mask of the thresholds it has."""
+        """Yield the H of each coefficient at `places` alone, and a mask of its thresholds."""
         return (self._parts[place] for place in places)
 
     @functools.cached_property
@@ -215,8 +214,8 @@ class HysteresisLaw:
         """
         Yield the contribution to H of each coefficient under a normalised v; shapes (n,).
 
-        The memory, shape (m,), holds the play outputs before the first sample, by default those
-        after a stage came down to zero.  `places` selects coefficients, by default all.
+        The memory, shape (m,), holds the play outputs before the first sample; by default the
+        stage last came down to zero.  `places` selects coefficients, by default all.
         """
         start = initial_memory(float(v[0]), self.thresholds) if memory is None else memory
         start = np.asarray(start, dtype=np.float64)

@@ -128,7 +128,7 @@ def path_lines(x: Array) -> Array:
 def lag_after(
     z: float, c0: float, c1: float, c2: float, d3: float, last: float, u: float, left: float
 ) -> float:
-    """Move a lag with the voltage to u; its distance to the steady answer shrinks to a share."""
+    """Move a lag to the voltage u; its distance to the steady answer shrinks to a share `left`."""
     new = c0 + u * (c1 + u * (c2 + u * d3))
     old = c0 + last * (c1 + last * (c2 + last * d3))
     return new + (z - old) * left

@@ -115,8 +115,8 @@ def four_sums(low: float, q: Array, c: Array, memory: Array) -> tuple[float, flo
     """
     Compute ``sum_i q_i f_i + psi_i(f_i)`` of four parts, whose plays are at f, shape (m,).
 
-    psi is `piezo_ident.operators.kernels.curve`; q and c come from `weights_of`.  A kernel keeps
-    the version of this function at the last change of its own file.
+    psi is `piezo_ident.operators.kernels.curve`; q and c come from `weights_of`.  A kernel of
+    another file takes over a change of this function only when its own file changes.
     """
     # the sums are written out, so that the loop over plays vectorises
     s_0, s_1, s_2, s_3 = 0.0, 0.0, 0.0, 0.0
