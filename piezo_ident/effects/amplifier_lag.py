@@ -60,7 +60,7 @@ class AmplifierLag(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """List lags from about a sample to a millisecond: small lags do not scale."""
+        """List lags from 0.7 of a sample: the effect of a smaller lag is not linear in it."""
         sample = 1.0 / view.sample_rate
         lags = ladder(0.7 * sample, max(1e-3, 10.0 * sample), 4)
         return tuple(cls.trial({}, steps={'time_constant': min(tau, 0.5)}) for tau in lags)

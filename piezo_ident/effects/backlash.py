@@ -49,7 +49,7 @@ class Backlash(Effect):
     needs = 'sweeps with turns in the middle and at the ends, slow and near the first resonance'
     parameters = (
         Parameter('width', '1', 'half-width rho of the play', NAN, 0.0, 2.0, scale='log'),
-        Parameter('gain', '1', 'share g that hangs in it', 0.0, 0.0, 10.0, step=0.1),
+        Parameter('gain', '1', 'share g of the stage behind the play', 0.0, 0.0, 10.0, step=0.1),
     )
 
     @classmethod

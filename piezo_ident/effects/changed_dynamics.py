@@ -17,19 +17,19 @@ class ChangedDynamics(Effect):
     """
     Modes in parallel with the output of G; the static gain does not change.
 
-    ``y = x + sum_m g_m (M_m - 1) x + k_m R_m x`` with ``M = w^2 / D``, ``R = w s / D`` and
+    ``y = x + sum_m (g_m (M_m - 1) + k_m R_m) x`` with ``M = w^2 / D``, ``R = w s / D`` and
     ``D = s^2 + 2 zeta w s + w^2``, each by the bilinear transform, prewarped at its own frequency.
 
     A resonance that moved from (w, zeta) to (w', zeta') has exactly this form, with the new
     frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: the
     old mode times the effect is the new mode.  An added mode with a share g has k = 0.  g
-    therefore stays below 1, and above -3 if a mode moved by at most a factor of two.  A larger
-    value far above the band would imitate any lag.
+    therefore stays below 1, and above -3 if a mode moved by at most a factor of two.  A mode far
+    above the band with a larger g would imitate any lag.
 
     Notes
     -----
-    A load m_L on a stage of moving mass m lowers its resonance by ``sqrt(m / (m + m_L))``.  Modes
-    as second-order sections: S. Devasia, E. Eleftheriou and S. O. R. Moheimani, "A survey of
+    A load m_L on a stage of mass m multiplies its resonance by ``sqrt(m / (m + m_L))``.  Modes as
+    second-order sections: S. Devasia, E. Eleftheriou and S. O. R. Moheimani, "A survey of
     control issues in nanopositioning", IEEE Trans. Control Syst. Technol. 15(5), 2007,
     pp. 802-823.  Bilinear transform with prewarping: A. V. Oppenheim and R. W. Schafer,
     "Discrete-Time Signal Processing".

@@ -19,10 +19,10 @@ from piezo_ident.operators.chain import Block
 
 #: time after a step up to which motion may belong to the dynamics [s]
 AT_ONCE = 0.05
-#: largest share of the later creep after a step that may run backwards
+#: largest creep against the direction of a step, as a share of the creep along it
 BACK = 0.5
-#: prior rms of a share: neighbouring elements hardly differ, so without the prior large shares of
-#: opposite sign would cancel each other in data of a few seconds, but not in other data
+#: prior rms of a share.  Neighbouring elements hardly differ: large shares of opposite sign could
+#: cancel each other in data of a few seconds, but not in other data
 SPREAD = 0.02
 
 
@@ -85,11 +85,11 @@ class Creep(Effect):
 
     def prepare(self) -> None:
         """Drop elements without a share."""
-        self._seen = np.flatnonzero(self.array('gain'))
-        self._c = self.array('gain')[self._seen]
-        times = self.array('time_constant')[self._seen]
+        self._active = np.flatnonzero(self.array('gain'))
+        self._c = self.array('gain')[self._active]
+        times = self.array('time_constant')[self._active]
         self._share = -np.expm1(-1.0 / (self.sample_rate * times))
-        self._beyond = np.zeros(self._c.size)
+        self._distance = np.zeros(self._c.size)
 
     def start_from(self, beyond: Array) -> None:
         """
@@ -102,12 +102,12 @@ class Creep(Effect):
                 f'creep: a start of {beyond.size} elements for {self.array("gain").size}; '
                 'take the start from this model'
             )
-        self._beyond = beyond[self._seen] if beyond.size else np.zeros(self._c.size)
+        self._distance = beyond[self._active] if beyond.size else np.zeros(self._c.size)
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """List elements spread over all times of the data, in two densities."""
-        # faster elements imitate the dynamics if these matter, or else a gain of H
+        # faster elements would imitate the dynamics, or a gain of H if the data are slow
         shortest = max(5.0 / view.sample_rate, 0.01 if view.is_fast else AT_ONCE)
         # a time constant far beyond the judged data would imitate a drift
         longest = max(min(view.duration, view.judged), 10.0 * shortest)
@@ -121,7 +121,7 @@ class Creep(Effect):
         Tell whether the creep after a step continues in the direction of the step.
 
         Shares of neighbouring time constants compensate each other, so a single share may be
-        negative; the fastest elements correct the dynamics.
+        negative.  The fastest elements may correct the dynamics and do not count.
         """
         gain, tau = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
         t = np.geomspace(min(AT_ONCE, tau.max()), tau.max(), 100)
@@ -130,7 +130,7 @@ class Creep(Effect):
 
     def reset(self, v0: float, x0: float) -> float:
         """Come to rest, with every element at its input plus the distance of `start_from`."""
-        self._state = x0 + self._beyond
+        self._state = x0 + self._distance
         return float(x0 + self._c @ self._state)
 
     def process(self, block: Block) -> Block:

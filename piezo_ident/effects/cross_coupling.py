@@ -52,9 +52,9 @@ class CrossCoupling(Effect):
             scale='fixed',
         ),
         Parameter('gain', '1/unit', 'static gain g', 0.0, -1e9, 1e9, step=1e-3),
-        Parameter('rate_gain', 's/unit', "gain g' of its rate", 0.0, -1e9, 1e9, step=1e-5),
+        Parameter('rate_gain', 's/unit', "gain g' of the rate", 0.0, -1e9, 1e9, step=1e-5),
         Parameter('frequency', 'Hz', 'corner of the low-pass', NAN, 1e-3, 1e6, scale='log'),
-        Parameter('damping', '1', 'its damping', NAN, 1e-3, 100.0, default=0.7, scale='log'),
+        Parameter('damping', '1', 'damping ratio', NAN, 1e-3, 100.0, default=0.7, scale='log'),
         Parameter(
             'offset', 'unit', 'value c0 without effect', NAN, -1e9, 1e9, default=0.0, scale='fixed'
         ),
@@ -63,8 +63,8 @@ class CrossCoupling(Effect):
     def prepare(self) -> None:
         """Build the filter of the channel."""
         frequency, gain = self.number('frequency'), self.number('gain')
-        # g M + g' s M = g + g (M - 1) + g' (s/S) R; s/S is taken at low frequencies, where the
-        # rate then is the rate of the channel for any prewarping
+        # g M + g' s M = g + g (M - 1) + g' (s/S) R with S as in `SecondOrderSection`.  The value
+        # of s/S at low frequencies makes the rate exact there for any prewarping
         slope = 2.0 * self.sample_rate / slope_of_mode(frequency, self.sample_rate)
         rate = self.number('rate_gain') * slope
         self._section = SecondOrderSection(
@@ -78,7 +78,7 @@ class CrossCoupling(Effect):
         """List every channel that moves, with three corners."""
         trials = []
         for name, (rest, std) in view.channels.items():
-            # the displacement of another axis is an answer, too, not a cause of shared motion
+            # the displacement of another axis answers shared motion, and does not cause it
             if role_of(name) == 'y' or not (np.isfinite(std) and std > 0):
                 continue
             for f in (10.0, 100.0, 1000.0):
@@ -93,7 +93,7 @@ class CrossCoupling(Effect):
     def is_plausible(cls, values: Mapping[str, Any]) -> bool:
         """Tell whether the low-pass is as fast as mechanics; a slower low-pass is a drift."""
         frequency, damping = float(values['frequency']), float(values['damping'])
-        # of two real poles, the slower pole counts
+        # overdamped, the low-pass has two real poles, and the slower pole counts
         slow = 1.0 if damping <= 1.0 else damping - np.sqrt(damping**2 - 1.0)
         return bool(slow * frequency >= SLOWEST)
 

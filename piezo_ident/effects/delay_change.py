@@ -37,7 +37,7 @@ class DelayChange(Effect):
     change = 'passed'
     in_dynamics = True
     description = (
-        'a delay other than the one identified; a sample at 20 kHz is 1.3 % of stroke at 120 Hz'
+        'a delay other than the identified delay; a sample at 20 kHz is 1.3 % of stroke at 120 Hz'
     )
     needs = 'a multisine, noise or steps well beyond the first resonance'
     in_delay_line = True

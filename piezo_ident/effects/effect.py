@@ -50,7 +50,7 @@ class Parameter:
     kind : str
         ``number`` or ``text``.
     step : float
-        For an amplitude: value at which the effect is about 1e-3 of the span; else 0.
+        For an amplitude: value that moves the output by about 1e-3 of the span; else 0.
     scale : str
         How a fit moves the parameter: ``linear``, ``log`` (its logarithm) or ``fixed``.
     tries : tuple
@@ -88,7 +88,7 @@ class Parameter:
         return self.step > 0.0
 
     def neutral_like(self, value: Value) -> Value:
-        """Give the neutral value; as a list if the given value is a list."""
+        """Give the neutral value, as a list as long as the value if the parameter is a list."""
         return np.full(np.size(value), self.neutral) if self.vector else self.neutral
 
     def clip(self, value: Any) -> Any:
@@ -156,7 +156,7 @@ class Effect:
     in_delay_line : bool
         Whether the effect changes the delay of the model, by `added_delay`, instead of the signal.
     contains : tuple of str
-        Effects that are special cases of this one, which must clearly err more than this one.
+        Special cases of this effect, which must err clearly more before this effect is named.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ class Effect:
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
         """
-        List the settings at which the effect is tried on given data.
+        List the settings at which the effect is tried on some data.
 
         By default, all combinations of the `tries` of parameters that are not amplitudes, with
         all amplitudes moved.  Such a parameter needs `tries` or a default, or no trial is left.
@@ -301,7 +301,7 @@ class Effect:
         steps: Mapping[str, float] | None = None,
     ) -> Trial:
         """
-        Make one trial: amplitudes at their neutral values, other parameters as given.
+        Make one trial: amplitudes at their neutral values, other parameters by `shape`.
 
         Parameters
         ----------

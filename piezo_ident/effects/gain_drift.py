@@ -97,7 +97,7 @@ class GainDrift(Effect):
 
     @classmethod
     def elsewhere(cls, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Give the mean gain of the record: H was fitted to the gain before the first knot."""
+        """Give the mean gain of the record, relative to the gain that the fitted H has."""
         checked = cls.check(values)
         time, gain = (np.asarray(checked[name], dtype=np.float64) for name in ('time', 'gain'))
         at = np.linspace(time[0], time[-1], 1000)

@@ -20,7 +20,7 @@ from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
 from scipy.linalg import expm
 
-#: repetitions of a sub-step; each lowers the error by the square of its phase over six
+#: repetitions of a sub-step; each multiplies the error by a sixth of the squared phase
 REPEATED = 3
 #: phase of a mode in a sub-step [rad] (physics: a twentieth of a radian integrates a loop to 1e-3)
 PHASE = 0.05
@@ -58,11 +58,11 @@ def run_loop(
     """
     Compute the force of the spring at each sample, and carry state and memory on.
 
-    `step` is the sub-step of q and p, each with the inputs at its begin and end.  `spring` holds
-    elastic, viscous, power, the number of sub-steps, square and cubic.  The rows of `elements` are
+    The rows of `step` give q and p from q, p and the inputs at both ends of a sub-step.  `spring`
+    holds elastic, viscous, power, number of sub-steps, square and cubic.  A row of `elements` has
     stiffness, threshold, gamma and skew.  `state` holds the last two inputs, q and p of the linear
-    mode and of the difference, and the force, all from rest; then input, q and force at rest.
-    `memory` holds the play and the slip of each element.
+    mode, their change by the spring, and the force, all from rest; then input, q and force at
+    rest.  A row of `memory` holds the play and the slip of an element.
     """
     count = int(spring[3])
     a, c, power, square, cubic = spring[0], spring[1], spring[2], spring[4], spring[5]
@@ -120,7 +120,7 @@ def mode_step(
     The sub-step is the argument `step` of `run_loop`.  Raises ModelError if the frequency is not
     below half the sampling rate.
     """
-    slope_of_mode(frequency, sample_rate)
+    slope_of_mode(frequency, sample_rate)  # refuses the frequency
     phase = 2.0 * math.pi * frequency / sample_rate
     # a power of two, so that a small change of the stiffness does not change the grid
     count = 2 ** max(0, math.ceil(math.log2(phase * math.sqrt(stiffest) / PHASE)))
@@ -213,7 +213,7 @@ class LoopHysteresis(Effect):
 
     @classmethod
     def mode(cls, values: Mapping[str, Any]) -> tuple[float, float]:
-        """Give frequency [Hz] and damping ratio of the mode with this spring."""
+        """Give frequency [Hz] and damping ratio of the mode in G that has this spring."""
         return float(values['frequency']), float(values['damping'])
 
     @classmethod
@@ -229,8 +229,8 @@ class LoopHysteresis(Effect):
             return ()
         frequency, damping = min(excited)
         mode = {'frequency': frequency, 'damping': damping}
-        # a sine at the resonance swings so much further than its command; all other motion does
-        # not, and the start of a fit lies between
+        # a sine at the resonance swings 1 / (2 damping) times as far as its command, other motion
+        # as far as its command; a fit starts at the geometric mean
         swing = view.span / math.sqrt(2.0 * damping)
         return tuple(
             cls.trial(

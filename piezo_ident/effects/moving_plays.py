@@ -17,7 +17,7 @@ from piezo_ident.common.kernel import alive, kernel, ordered_kernel
 from piezo_ident.operators.kernels import curve, curve_slope, held
 from piezo_ident.operators.parts import four_sums
 
-#: growth of the lower edge, even and relative, and of the upper edge
+#: growth of the lower edge, equal for all plays and relative; both for the upper edge
 Growth = tuple[float, float, float, float]
 
 

@@ -42,8 +42,8 @@ class NoncongruentMinorLoops(Effect):
     ``w = H[v] + sum_j (kappa_j (v - c) F_rho_j[v] + lambda_j F_rho_j[v]^2)``.  The weight grows
     with the voltage (kappa) or with the output of the play (lambda).  In a Prandtl-Ishlinskii
     operator all minor loops between the same two voltages are congruent.  Without its cubic, all
-    loops of the same width at different biases are congruent, too.  A weight that grows with the
-    voltage breaks this.  The plays have thresholds and a memory of their own.
+    loops of the same width at different biases are congruent, too.  With a weight that grows with
+    the voltage they are not.  The plays have thresholds and a memory of their own.
 
     After `reset` each play has the output of a play of H with the same threshold.  By default
     this is the state of a stage that last came down to zero (`Hysteresis.initial_memory`).  If H
@@ -100,7 +100,7 @@ class NoncongruentMinorLoops(Effect):
         )
 
     def reset(self, v0: float, x0: float) -> float:
-        """Come to rest, with plays as H would have them."""
+        """Come to rest, with the outputs of plays of H."""
         w = self.inner.reset(v0, x0)
         memory, core = initial_memory(x0, self._r), self.core
         if isinstance(core, HysteresisOperator):

@@ -16,8 +16,8 @@ class PreloadLoss(Effect):
     Kink in the static curve at the voltage where the preload runs out.
 
     ``x = h - k max(0, theta - v)``: below theta the joint opens and its stiffness changes, so the
-    displacement follows the command with another slope.  The kink stays at the same voltage on
-    every loop.
+    displacement follows the command with a slope larger by k.  The kink stays at the same voltage
+    on every loop.
 
     Notes
     -----
@@ -35,7 +35,7 @@ class PreloadLoss(Effect):
     )
     needs = 'slow sweeps over the full range, and minor loops on both sides of the kink'
     parameters = (
-        Parameter('gain', '1', 'loss k of slope below theta', 0.0, 0.0, 1.0, step=3e-3),
+        Parameter('gain', '1', 'slope k added below theta', 0.0, 0.0, 1.0, step=3e-3),
         Parameter('threshold', '1', 'voltage theta of the kink', NAN, -10.0, 10.0),
     )
 
@@ -50,7 +50,7 @@ class PreloadLoss(Effect):
         return x0 - self.number('gain') * max(0.0, self.number('threshold') - v0)
 
     def process(self, block: Block) -> Block:
-        """Subtract the loss below the kink from the block."""
+        """Add the slope below the kink to the block."""
         loss = np.maximum(0.0, self.number('threshold') - block.v)
         return block.with_signal(block.x - self.number('gain') * loss)
 

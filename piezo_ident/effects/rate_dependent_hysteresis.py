@@ -31,9 +31,9 @@ from piezo_ident.operators.parts import (
     weights_of,
 )
 
-#: relative step of the cutoff for the derivative of the power by it
+#: relative step of the cutoff, for the derivative of the power by the cutoff
 NEAR = 1e-5
-#: parameters that scale the growth, and parameters that shape it, in the order of the loops
+#: parameters that scale the growth, and parameters that shape it, in the order of the kernels
 AMPLITUDES = ('gain', 'stretch', 'lead', 'lead_stretch')
 SHAPE = ('exponent', 'levelling', 'cutoff')
 #: the slope of the power below this speed is taken at this speed [spans/s]

@@ -67,12 +67,12 @@ class SlewLimit(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """List limits at the speeds of the data, including the lowest, and up to a jump."""
+        """List limits at the speeds of the data, and up to the speed of a jump."""
         speeds = np.unique(view.speeds[view.speeds > 0])
         if speeds.size == 0:
             return ()
         fastest = float(speeds[-1])
-        # jumps are too rare to show in the quantiles; a limit that never acts changes nothing
+        # jumps are too rare to show in the quantiles of the speed
         jump = max(fastest, 0.5 * view.span * view.sample_rate)
         limits = [*speeds[:-1].tolist(), *(np.array([0.7, 0.8, 0.9]) * fastest)]
         limits += ladder(fastest, jump, 6)[1:]

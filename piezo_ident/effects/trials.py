@@ -26,8 +26,7 @@ class View:
     low, high : float
         Range of the normalised command u.
     speeds : ndarray, shape (n,)
-        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 of the speeds above zero, and perhaps
-        the maximum.
+        ``|du/dt|`` [1/s], ascending: quantiles 0.1 .. 0.999 of the speeds in motion.
     duration : float
         Length of the longest record [s].
     channels : mapping of str to (float, float)
