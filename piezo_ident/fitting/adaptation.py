@@ -17,12 +17,12 @@ for the theta_j that a group informs about, and never below the information of t
 
     L <- A L A + (1 - A^2) L0 + f f' / R,      A_j^2 = 1 - (1 - mu) s_j / (s_j + e R)
 
-L is the information, L0 the diagonal information of the prior, s_j = f_j^2 / L0_jj.  A stage at
-rest informs about no theta_j, so theta is kept.  Half-spaces bound theta: the weights of the plays
-stay positive, H rises, and each change has a plausible size.  A theta outside of a half-space
-moves onto it along L^-1.  Measurements far from the prediction are refused at first.
-They mean another stage if they last for `PATIENCE`, after which the high-pass has forgotten a step
-of the sensor.  The information then returns to the prior.
+L is the information, L0 the diagonal information of the prior, R the variance of a measurement,
+s_j = f_j^2 / L0_jj, mu follows from `MEMORY`, and e is `TELLS` of the kernel.  A stage at rest
+informs about no theta_j, so theta stays.  Half-spaces bound theta: the weights of plays stay
+positive, H rises, and each change has a plausible size.  A theta outside of a half-space moves
+onto it along L^-1.  Measurements far from the prediction are refused for `PATIENCE`, in which the
+high-pass forgets a step of the sensor.  Later they mean another stage: L returns to the prior.
 
 J. E. Parkum, N. K. Poulsen and J. Holst, "Recursive forgetting algorithms", Int. J. Control 55(1),
 1992, doi:10.1080/00207179208934228.
@@ -193,7 +193,7 @@ class Adaptation:
         return np.array(rows)
 
     def restore(self) -> None:
-        """Return to the given model."""
+        """Return to the model without learnt changes."""
         self._theta = np.zeros(len(self._changes) + 1)
         self._information, self._now = self._prior.copy(), np.zeros(kernel.PLACES)
         self._now[kernel.SCALE] = 1.0

@@ -9,9 +9,9 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import ordered_kernel
 
-#: smallest signal of a measurement that is used, as a share of its variance
+#: least squared signal of a measurement that is used, as a share of the variance of its noise
 TELLS = 1e-2
-#: share of refused measurements that is tolerated; more of them mean another stage in the end
+#: share of refused measurements that is tolerated; a larger share means another stage
 RARE = 0.1
 
 # places in `now`: samples of the group, finite samples of it, refused measurements, scale of the
@@ -72,7 +72,7 @@ def _constrain(theta: Array, P: Array, halves: Array, way: Array) -> None:
         share = worst / _times(P, halves[at, :n], way) * (1.0 + 1e-9)
         for i in range(n):
             theta[i] -= way[i] * share
-    # no allowed point was found: go halfway back to the given model
+    # no allowed point was found: go halfway back to the model without changes
     for i in range(n):
         theta[i] *= 0.5
 

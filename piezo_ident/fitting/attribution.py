@@ -10,8 +10,8 @@ the velocity stand for the dynamics.  A changed model runs for wider plays, and 
 poles.  Effects, G and delay then act on these changes as they act on the stage.  A high-pass
 removes offset, drift and creep of earlier motion, which an observer corrects.  Old samples fade.
 
-The best part alone must explain most of the error.  Two parts are named if the best two leave much
-less than the best one, and three likewise.
+The best part alone must explain most of the error.  A second part is named if the best two parts
+leave much less than the best part, and a third part likewise.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ NEEDED = 2.0
 BATCH = 0.1
 #: smallest change of gain or loop that is named, in standard deviations (taste)
 SURE = 3.0
-#: share of the squared error by which one more part must reduce it (taste)
+#: least reduction of the squared error by one more part, as a share of the whole (taste)
 FAINT = 2e-3
 #: distance from the median of a block, in median deviations, beyond which an error is left out:
 #: twelve standard deviations of a normal law (taste)
@@ -159,7 +159,7 @@ class Attribution:
             return
         far = np.abs(e - np.median(e[counts]))
         wild = far > WILD * np.median(far[counts])
-        # many of them are real motion of the stage
+        # many wild samples are real motion of the stage
         if np.count_nonzero(wild) <= MAX_WILD * x.size:
             counts &= ~wild
         rows = [x, *before[1:], self._rate * np.gradient(x), interpolated(e, ~counts)]
@@ -200,7 +200,7 @@ class Attribution:
         # independent error for two correlation lengths.
         std = np.sqrt(max(left, self._error**2) * spread / swing)
         size = np.where(np.arange(ERROR) < 2, 1.0, np.sqrt(np.diag(self._products)[:ERROR] / n))
-        # a velocity that is missing is a delay
+        # a delay adds a negative multiple of the velocity
         value, std = values * size * [1.0, 1.0, 1.0, -1.0], std * size
         causes = [
             Cause(part, float(value[list(at)].sum()), float(np.hypot.reduce(std[list(at)])))

@@ -22,11 +22,10 @@ from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear, nnls
 
-#: share of the energy of a column that is added to the diagonal, which rounding could make
-#: negative.  Products of double precision numbers keep single precision
+#: share of the energy of a column that is added to the diagonal.  Products square the condition of
+#: the columns, and rounding could make a pivot negative
 RIDGE = 1e-10
-#: largest violation of a row, a rounding error of slopes of about one, and most rows that one step
-#: may hold
+#: largest violation of a row, a rounding error of slopes of about one, and most rows in one step
 UNDERCUT, CUTS = 1e-7, 40
 
 
@@ -86,8 +85,8 @@ def bounded_step(
     Minimise ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; the step has shape (p,).
 
     `damping` is a share of the energy of each column.  `rising` holds rows, shape (k, p), and the
-    smallest allowed value of each row, shape (k,): ``rows x`` is at least that, if such an x
-    exists.  Raises IdentificationError if the equations are not finite.
+    least value of ``rows x``, shape (k,), which the step keeps if an x with these values exists.
+    Raises IdentificationError if the equations are not finite.
 
     Examples
     --------

@@ -6,7 +6,7 @@ Fit a stage by Gauss-Newton on the free-run error, inside bounds, with priors an
 
 Damping after D. W. Marquardt, J. Soc. Indust. Appl. Math. 11(2), 1963, pp. 431-441,
 doi:10.1137/0111030.  Each step solves one bounded least-squares problem for all parameters
-together.  Each step therefore finds the linear parameters, mainly the weights of H, exactly.
+together, and so finds the linear parameters, mainly the weights of H, almost exactly.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def _step(
     middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
     A = equations.A.sum(axis=0) + weight
     b = equations.b.sum(axis=0) + weight @ (middle - values)
-    height, rising = _height(values - middle, weight), here.stage.rising
+    cost, rising = _prior_cost(values - middle, weight), here.stage.rising
     bounds = lower - values, upper - values
     while damping < MOST:
         step = bounded_step(A, b, *bounds, damping=damping, rising=rising)
@@ -168,14 +168,14 @@ def _step(
         except ModelError:
             damping *= WORSE
             continue
-        gained = here.loss - there.loss + height - _height(there.stage.values - middle, weight)
+        gained = here.loss - there.loss + cost - _prior_cost(there.stage.values - middle, weight)
         if gained > 0.0:
             return there, gained, damping
         damping *= WORSE
     return None, 0.0, damping
 
 
-def _height(away: Array, weight: Array) -> float:
+def _prior_cost(away: Array, weight: Array) -> float:
     """Compute the contribution of a prior to the loss."""
     return float(away @ weight @ away)
 

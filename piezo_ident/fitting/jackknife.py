@@ -21,7 +21,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.fitting.free_run import Fit
 from piezo_ident.fitting.stage import Stage
 
-#: share of a step that a replicate takes: quantities are linearised, as the equations are
+#: share of a step that a replicate takes, so that its quantities are linear in the step
 SHARE = 0.1
 #: share of the energy of a column that is added to the diagonal.  Combinations of columns with
 #: less information in the data stay fixed in all replicates
@@ -60,7 +60,7 @@ class Linearised:
             try:
                 yield self.stage.moved(values + SHARE * step)
             except ModelError:
-                # this far the linear equations do not reach
+                # the linear equations do not hold so far away
                 continue
 
 

@@ -4,10 +4,10 @@
 """
 Compare fits by their prediction of held-out data.
 
-The error of a candidate is the geometric mean of two mean squares.  One holds out interleaved
-blocks, the other whole kinds of motion.  Blocks alone would prefer an H that follows known motion
-and errs on other motion; kinds alone are too few.  The candidate with the fewest parameters wins
-if errors are alike.
+The error of a candidate is the geometric mean of two mean squares.  One mean square holds out
+interleaved blocks, the other whole kinds of motion.  Blocks alone would prefer an H that follows
+known motion and errs on other motion; kinds alone are too few.  Of candidates with alike errors,
+the candidate with the fewest parameters wins.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Candidate:
 
     @property
     def price(self) -> float:
-        """Error divided by `EFFECT` for each effect, so that an effect must earn its place."""
+        """Error divided by `EFFECT` for each effect, so that an effect must lower it as much."""
         return float(self.error / EFFECT**self.effects)
 
 
