@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compute everything that the pictures of a residual show, curves of its mean among it."""
+"""Compute noise floor, lines, curves and coherence of a residual for its pictures."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from piezo_ident.residual.stretches import (
     Stretch,
 )
 
-#: samples after averaging, bins of a curve, bins a decade of time or speed
+#: most samples of a curve after averaging, bins of a curve, bins in a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
-#: independent stretches of time: so many, of this length at least [s]
+#: number of stretches of time that count as independent, and their least length [s]
 CHUNKS, CHUNK_TIME = 120, 0.05
-#: fewest samples and stretches of time in a shown bin
+#: fewest samples and stretches of time in a bin of a curve
 FEWEST, VISITS = 8, 3
 
 
@@ -35,9 +35,9 @@ class Curve:
     """
     Mean residual over bins of one quantity, 'v', 'dv/dt' or 'time since the step'.
 
-    The branch is the direction of the drive, 'up', 'down' or 'both'.  The residual of 'both' is
-    multiplied by the step as a share of the largest step: upward and downward steps add up.  `x`
-    are the means of the quantity in each bin, `mean` and `std` the mean residual and its standard
+    The branch is the direction of the drive, 'up', 'down' or 'both'.  In 'both' each residual is
+    multiplied by its step as a share of the largest step, so that steps of both signs add up.  `x`
+    holds the mean of the quantity in each bin, `mean` and `std` the mean residual and its standard
     deviation [m], shapes (m,).  A whole stretch of time is one observation, as its samples are
     correlated.
     """
@@ -64,7 +64,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     """
     Analyse the residual of a model without its outliers and clipped readings.
 
-    DataError if there is no sound sample.
+    Raises DataError if no sample is sound.
     """
     if not any(part.mask.any() for part in parts):
         raise DataError('no sample of the residual is sound; give a record with sound samples')
@@ -75,7 +75,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     ]
     stretches = all_stretches(clean)
     lines = find_lines(clean, stretches).lines
-    # a line is no noise: a model may carry it
+    # a line does not count as noise, because an effect can explain it
     quiet = [without_lines(part, lines) for part in clean]
     return ResidualAnalysis(
         parts=tuple(parts),
@@ -86,17 +86,17 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     )
 
 
-#: of a hold: bins of time, mean residual in each, step as a share of the largest
+#: bins of time of a hold, mean residual in each bin, step as a share of the largest step
 _Hold = tuple[Integers, Array, float]
 
 
 def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
-    """Return the mean residual over v, dv/dt, and the time since the last step, as data allow."""
+    """Compute the mean residual over v, dv/dt and the time since a step, if the data have them."""
     return (*_of_motions(parts, stretches), *_since_step(parts, stretches))
 
 
 def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
-    """Return the mean residual over v and dv/dt, for both directions of the motions."""
+    """Compute the mean residual over v and dv/dt, for both directions of the drive."""
     moving = [s for s in stretches if s.kind != 'rest']
     if not moving:
         return []
@@ -119,16 +119,16 @@ def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     ends = np.linspace(v.min(), v.max() + 1e-12, BINS + 1)
     bins = np.clip(np.searchsorted(ends, v, side='right') - 1, 0, BINS - 1)
     ways = (('up', speed > 0.0), ('down', speed < 0.0))
-    found = [_curve('v', branch, v, e, bins, visits, own) for branch, own in ways]
-    # speeds span decades, and a triangle has only one
+    curves = [_curve('v', branch, v, e, bins, visits, own) for branch, own in ways]
+    # speeds span decades, but a triangle has a single speed
     moves = np.abs(speed) > 1e-6 * np.abs(speed).max()
     if moves.sum() >= 4 * BINS:
         decades = np.full(speed.size, np.inf)
         decades[moves] = np.floor(PER_DECADE * np.log10(np.abs(speed[moves])))
         bins = np.where(moves, decades - decades.min(), 0.0).astype(np.int64)
         for branch, own in ways:
-            found.append(_curve('dv/dt', branch, speed, e, bins, visits, own & moves))
-    return found
+            curves.append(_curve('dv/dt', branch, speed, e, bins, visits, own & moves))
+    return curves
 
 
 def _curve(
@@ -140,7 +140,7 @@ def _curve(
     filled = np.maximum(count, 1)
     centre = np.bincount(bins, x, size) / filled
     mean = np.bincount(bins, e, size) / filled
-    # a stretch of time enters with its sum in a bin
+    # all samples of a stretch of time in a bin are one observation, their sum
     pair, visit = np.unique(bins * (int(chunk.max(initial=0)) + 1) + chunk, return_inverse=True)
     sums = np.bincount(visit, e - mean[bins])
     home = pair // (int(chunk.max(initial=0)) + 1)
@@ -154,7 +154,7 @@ def _curve(
 
 
 def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
-    """Return the residual of the holds over lg t; each hold has its own offset."""
+    """Compute the residual of the holds over lg t; each hold has its own offset."""
     holds = [s for s in stretches if s.kind == 'rest' and s.step != 0.0]
     if len(holds) < 2:
         return []

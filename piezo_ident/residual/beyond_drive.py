@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tests of further channels as a cause of a residual that no function of the drive explains."""
+"""Test further channels as causes of a residual that no function of the drive explains."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from piezo_ident.residual.coherence import coherence
 from piezo_ident.residual.stretches import block_means, ResidualPart
 from scipy import fft, linalg, signal, stats
 
-#: rate of the tested means [Hz]
+#: approximate rate of the means of samples that are tested [Hz]
 RATE = 2500.0
-#: plays of the drive, and of a channel, as shares of the range
+#: thresholds of the plays of the drive, and of a channel, as shares of the range
 PLAYS, CHANNEL_PLAYS = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.75, 0.9), (0.1, 0.4)
 #: corners of the low-passes behind each function [Hz]
 CORNERS = (0.3, 2.0, 10.0, 50.0, 250.0)
-#: least share of a direction among functions, beyond rounding
+#: least eigenvalue of a direction of drive or channel functions, as a share of the largest one
 RANK, CHANNEL_RANK = 1e-6, 1e-3
-#: half waves over a record that count as drift, and settling time at its start [s]
+#: number of cosines over a record that stand for drift, and settling time at its start [s]
 SLOW, SETTLING = 24, 0.5
-#: least share of a channel beyond the drive, and largest coherent share of its power
+#: a channel follows the drive if less of its power is left without it, or if more is coherent
 OWN, FOLLOWS = 0.01, 0.9
-#: coefficients of the filter that makes a residual white, and the window of its level [s]
+#: coefficients of the filter that makes a residual white, and window of the rms of a residual [s]
 WHITE, LEVEL = 32, 0.1
 #: chance that an unrelated channel is taken for a cause
 SIGNIFICANT = 1e-5
-#: least share of the gain in parts that are held out of the fit, and number of these parts
+#: least gain on held-out parts, as a share of the gain of the fit, and number of the parts
 KEPT, FOLDS = 0.5, 5
 #: least shift of a surrogate, as a share of a record
 AROUND = 0.05
@@ -53,55 +53,55 @@ class ChannelTest:
 
     @property
     def tells(self) -> bool:
-        """Whether the channel moves by itself, and causes: the motion of an axis does not."""
+        """Whether the channel moves by itself and can be a cause; a displacement cannot."""
         return bool(self.added) and role_of(self.channel) != 'y'
 
 
 def drive_functions(v: Array, rate: float) -> Array:
     """
-    Return functions of a drive that may sum up to a hysteresis, a lag or a creep, shape (n, k).
+    Compute functions of a drive whose sums imitate hysteresis, lag and creep, shape (n, k).
 
     The functions are the drive v, shape (n,), its square and cube, its plays, and every second
-    play times the drive, which lets loops lean.  Each comes with its first and second difference,
-    and behind low-passes.
+    play times the drive, which lets loops lean.  Differences of first and second order, and
+    low-passes, of each function follow it.
     """
     span = float(np.ptp(v))
     u = (v - v.min()) / span if span > 0.0 else np.zeros(v.size)
-    some = [u, *play_columns(u, PLAYS)]
-    some += [u * u, u**3, *(u * f for f in some[1::2])]
+    functions = [u, *play_columns(u, PLAYS)]
+    functions += [u * u, u**3, *(u * f for f in functions[1::2])]
     columns = []
-    for x in some:
+    for x in functions:
         columns += [x, np.diff(x, prepend=x[0]), np.diff(x, 2, prepend=(x[0], x[0]))]
         columns += _lagged(x, rate)
     return np.stack(columns, axis=1)
 
 
 def without_drive(e: Array, v: Array, rate: float, use: Mask) -> Array:
-    """Return a residual without the best sum of functions of the drive, shape (n,)."""
+    """Subtract the best sum of functions of the drive from a residual, shape (n,)."""
     A = np.hstack([drive_functions(v, rate), _slow(e.size)])
     return np.asarray(e - A @ _solve(A[use], e[use]))
 
 
 def _slow(n: int) -> Array:
-    """Return slow functions of time that stand for drift and creep, shape (n, k)."""
+    """Compute slow cosines of time that stand for drift and creep, shape (n, k)."""
     return np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(SLOW)))
 
 
 def _solve(A: Array, e: Array) -> Array:
-    """Return the least-squares coefficients of columns (n, k), without directions of rounding."""
+    """Solve least squares for the coefficients of columns (n, k), without tiny eigenvalues."""
     scale, values, vectors = _directions(A, RANK**1.5)
     return np.asarray(vectors @ ((vectors.T @ (A.T @ e / scale)) / values) / scale)
 
 
 def _basis(A: Array, rank: float) -> tuple[Array, Array]:
-    """Return an orthonormal basis of columns (n, k), and its combinations of the columns."""
+    """Compute an orthonormal basis of columns (n, k), and the matrix that makes it of them."""
     scale, values, vectors = _directions(A, rank)
     made = vectors / np.sqrt(values) / scale[:, None]
     return A @ made, made
 
 
 def _directions(A: Array, rank: float) -> tuple[Array, Array, Array]:
-    """Return the sizes of columns, and the larger eigenvalues of their products with vectors."""
+    """Compute the norms of columns, and eigenvalues and vectors of their scaled Gram matrix."""
     N = A.T @ A
     scale = np.maximum(np.sqrt(np.diag(N)), 1e-300)
     values, vectors = linalg.eigh(N / scale / scale[:, None])
@@ -121,7 +121,7 @@ class _Part:
     rate: float
 
     def beyond(self, x: Array, channel: Array | None = None) -> Array:
-        """Return a signal less its best functions of the drive, and of a channel."""
+        """Subtract the best functions of the drive, and of a channel if any, from a signal."""
         A = self.drive if channel is None else np.hstack([self.drive, channel])
         return np.asarray(x - A @ _solve(A[self.use], x[self.use]))
 
@@ -144,15 +144,15 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     having = [part for part in parts if name in part.piece.channels]
     every = [_part_of(part, name) if name in part.piece.channels else None for part in parts]
     rate = max((p.rate for p in every if p), default=0.0)
-    found = [p for p in every if p and p.rate == rate and p.use.sum() > 4 * WHITE]
-    moves = any(np.ptp(p.own[p.use]) > 0.0 for p in found)
-    if not moves or _follows(having, name, found):
+    judged = [p for p in every if p and p.rate == rate and p.use.sum() > 4 * WHITE]
+    moves = any(np.ptp(p.own[p.use]) > 0.0 for p in judged)
+    if not moves or _follows(having, name, judged):
         return ChannelTest(name)
-    levels = [_level(p) for p in found]
+    levels = [_level(p) for p in judged]
     # only the rest is made white: whitening would remove a channel that is a single tone
-    at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(found, levels, strict=True)]
+    at_level = [(p.beyond(p.e, p.channel) / s)[p.use] for p, s in zip(judged, levels, strict=True)]
     white = _whitening(np.concatenate(at_level))
-    weighed = list(zip(found, levels, strict=True))
+    weighed = list(zip(judged, levels, strict=True))
     E = np.concatenate([_white(p.e[:, None], p, s, white)[:, 0] for p, s in weighed])
     B = linalg.block_diag(*(_white(p.drive, p, s, white) for p, s in weighed))
     C = np.vstack([_white(p.channel, p, s, white) for p, s in weighed])
@@ -165,7 +165,7 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
     added: list[Array | None] = []
     for part, p in zip(parts, every, strict=True):
         added.append(None)
-        if any(p is one for one in found) and p is not None:
+        if any(p is one for one in judged) and p is not None:
             m = max(1, int(part.piece.sample_rate / RATE))
             means = p.channel @ coefficients
             middle = np.arange(means.size) * m + 0.5 * (m - 1)
@@ -177,12 +177,12 @@ def _tested(name: str, parts: Sequence[ResidualPart]) -> ChannelTest:
 def without_channels(
     parts: Sequence[ResidualPart], tests: Sequence[ChannelTest]
 ) -> list[ResidualPart]:
-    """Subtract the contributions of significant channels; their lines then pass for no hum."""
+    """Subtract the contributions of significant channels, so that their lines are not hum."""
 
     def squares(parts: Sequence[ResidualPart]) -> float:
         return sum(float(np.sum(part.e[part.mask] ** 2)) for part in parts)
 
-    # voltage and displacement of one axis explain the same, and each was tested alone
+    # voltage and displacement of one axis explain the same part: only the better one is subtracted
     of_axis: dict[str, list[list[ResidualPart]]] = {}
     for t in tests:
         if t.significant:
@@ -200,17 +200,17 @@ def without_channels(
     return found
 
 
-def _follows(having: Sequence[ResidualPart], name: str, found: Sequence[_Part]) -> bool:
-    """Return whether the drive, or drift, explains a channel."""
-    left = sum(float(np.sum(p.beyond(p.own)[p.use] ** 2)) for p in found)
-    whole = sum(float(np.sum((x - x.mean()) ** 2)) for x in (p.own[p.use] for p in found))
+def _follows(having: Sequence[ResidualPart], name: str, judged: Sequence[_Part]) -> bool:
+    """Tell whether the drive, or drift, explains a channel."""
+    left = sum(float(np.sum(p.beyond(p.own)[p.use] ** 2)) for p in judged)
+    whole = sum(float(np.sum((x - x.mean()) ** 2)) for x in (p.own[p.use] for p in judged))
     signals = [(part, _known(part.piece.channels[name])) for part in having]
     of_drive = coherence([part.with_residual(c) for part, c in signals if np.isfinite(c).all()])
     return left < OWN * whole or (of_drive is not None and of_drive.share > FOLLOWS)
 
 
 def _part_of(part: ResidualPart, name: str) -> _Part:
-    """Return the means of a part, with functions of channel `name`."""
+    """Average a part to `RATE`, and compute the functions of drive and channel `name`."""
     m = max(1, int(part.piece.sample_rate / RATE))
     rate = part.piece.sample_rate / m
     e, v, c = (block_means(x, m) for x in (part.e, part.piece.v, part.piece.channels[name]))
@@ -218,7 +218,7 @@ def _part_of(part: ResidualPart, name: str) -> _Part:
     use[: min(round(SETTLING * rate), e.size // 8)] = False
     c = _known(c)
     drive = np.hstack([drive_functions(v, rate), _slow(e.size)])
-    # a stage may follow a channel itself, late, fast, and with a hysteresis of its own
+    # a stage may follow the channel, its lags, its rate, and its plays
     span = float(np.ptp(c))
     u = (c - c[0]) / span if span > 0.0 else np.zeros(c.size)
     columns = [u, np.diff(u, prepend=u[0]), *play_columns(u - u.min(), CHANNEL_PLAYS)]
@@ -227,22 +227,22 @@ def _part_of(part: ResidualPart, name: str) -> _Part:
 
 
 def _known(channel: Array) -> Array:
-    """Return a channel with straight lines for its unknown samples."""
+    """Replace the unknown samples of a channel by straight lines."""
     return interpolated(channel, ~np.isfinite(channel))
 
 
 def _lagged(x: Array, rate: float, corners: Sequence[float] = CORNERS) -> list[Array]:
-    """Return a signal behind low-passes, from rest at its first value."""
-    found = []
+    """Pass a signal through low-passes, from rest at its first value."""
+    lagged = []
     for corner in corners:
         if corner < 0.2 * rate:
             a = float(np.exp(-2.0 * np.pi * corner / rate))
-            found.append(signal.lfilter([1.0 - a], [1.0, -a], x, zi=[a * x[0]])[0])
-    return found
+            lagged.append(signal.lfilter([1.0 - a], [1.0, -a], x, zi=[a * x[0]])[0])
+    return lagged
 
 
 def _level(p: _Part) -> Array:
-    """Return the rms of a residual around each sample, never below a hundredth of the whole."""
+    """Compute the rms of a residual around each sample, at least a hundredth of the whole rms."""
     window = np.ones(max(8, round(LEVEL * p.rate)))
     e = np.where(p.use, p.beyond(p.e), 0.0)
     power = np.convolve(e * e, window, 'same')
@@ -251,15 +251,15 @@ def _level(p: _Part) -> Array:
 
 
 def _white(x: Array, p: _Part, level: Array, white: Array) -> Array:
-    """Return signals (n, k) at one level and white, at samples that count."""
-    # the start of the filter, and samples behind those that do not count, look like a jump
+    """Divide signals (n, k) by a level and whiten them, at samples that count."""
+    # the filter needs as many samples that count as it has coefficients
     settled = np.convolve(p.use.astype(np.float64), np.ones(white.size))[: p.use.size]
     whitened = signal.lfilter(white, [1.0], x / level[:, None], axis=0)
     return np.asarray(whitened[settled > white.size - 0.5])
 
 
 def _whitening(e: Array) -> Array:
-    """Return the prediction error filter of a residual (Levinson)."""
+    """Compute the prediction error filter of a residual (Levinson)."""
     n = e.size
     spectrum = np.abs(fft.rfft(e - e.mean(), 2 * n)) ** 2
     r = fft.irfft(spectrum)[: WHITE + 1] / n
@@ -270,7 +270,7 @@ def _whitening(e: Array) -> Array:
 
 
 def _held_out(e: Array, P: Array) -> float:
-    """Return the gain in squares of held-out stretches with equal motion."""
+    """Compute the gain in squares on held-out stretches with equal squares of the columns P."""
     moved = np.cumsum(np.sum(P**2, axis=1))
     edges = np.searchsorted(moved, np.linspace(0.0, moved[-1], FOLDS + 1)[1:-1])
     total = 0.0
@@ -283,18 +283,18 @@ def _held_out(e: Array, P: Array) -> float:
 
 def _chance(e: Array, P: Array) -> tuple[float, float, float]:
     """
-    Return the chance of a gain, the gain as a share of e, and its bound.
+    Compute the chance of a gain, the gain as a share of the power of e, and its bound.
 
-    The surrogates are all circular shifts of e, less its projection on the columns of P, against
-    those columns.  Their gains are coherences: a beta distribution of their mean and variance
-    gives smaller chances than their number.
+    The surrogates are the circular shifts of e without its projection on the columns of P.  Their
+    gains on these columns are coherences.  A beta distribution with their mean and variance also
+    gives chances that are smaller than one in their number.
     """
     n, k = P.shape
     power = float(e @ e)
     if power == 0.0 or k == 0:
         return 1.0, 0.0, 1.0
     size = fft.next_fast_len(n, real=True)
-    # zeros behind a series do its shifts no harm
+    # a few zeros behind a series hardly change its shifts
     rest = e - P @ (P.T @ e)
     E = np.conj(fft.rfft(rest, size))
     gains = np.zeros(size)
@@ -307,7 +307,7 @@ def _chance(e: Array, P: Array) -> tuple[float, float, float]:
     mean, spread = float(others.mean()), float(others.var())
     if spread == 0.0:
         return 1.0, gain, 1.0
-    # a and b of the mean and the variance; one column and L observations have 1 and L - 1
+    # a + b of the beta distribution; one column and L observations have a = 1 and b = L - 1
     total = mean * (1.0 - mean) / spread - 1.0
     law = stats.beta(mean * total, (1.0 - mean) * total)
     chance = max(float(law.sf(gain)), 1e-300)

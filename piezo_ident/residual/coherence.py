@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Spectra of two signals, and the coherence of voltage and residual, with a bound."""
+"""Compute spectra of two signals, and the coherence of voltage and residual with a bound."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.residual.stretches import ResidualPart
 from scipy import fft, signal
 
-#: samples whose segments are transformed at once
+#: number of samples that are transformed at once
 TOGETHER = 1 << 18
 #: confidence of the bound
 CONFIDENCE = 0.99
-#: averages of a coherence, longest segment [samples]
+#: number of averages of a coherence, and longest segment [samples]
 AVERAGES, SEGMENT = 32, 8192
 #: least density of an input, as a share of its largest density
 EXCITED = 1e-7
@@ -48,10 +48,10 @@ def cross_spectra(
     u: Array, y: Array, size: int, *, linear: bool = True
 ) -> tuple[Array, Array, NDArray[np.complex128]]:
     """
-    Return the sums of the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
+    Sum the spectra of two signals by Welch's method: S_uu, S_yy and S_uy.
 
-    The Hann segments of some size, at most n, overlap by half.  Each loses its line, or its mean
-    without `linear`.  The sums, shape (size // 2 + 1,), have no unit: only their ratios count.
+    The Hann segments of `size` samples overlap by half.  Each loses its linear trend, or without
+    `linear` its mean.  The sums, shape (size // 2 + 1,), have no unit: only their ratios count.
     """
     window, step = signal.get_window('hann', size), size - size // 2
     segments = [np.lib.stride_tricks.sliding_window_view(x, size)[::step] for x in (u, y)]
@@ -76,9 +76,9 @@ def _detrended(x: Array, linear: bool) -> Array:
 
 def coherence(parts: Sequence[ResidualPart]) -> Coherence | None:
     """
-    Return the coherence of voltage and residual by Welch's method; None for short records.
+    Compute the coherence of voltage and residual by Welch's method; None for short records.
 
-    Parts of the rate with most samples are used.  Bendat and Piersol, Random Data, 4th ed. (2010),
+    Parts at the rate with most samples count.  Bendat and Piersol, Random Data, 4th ed. (2010),
     section 9.2, doi:10.1002/9781118032428.
     """
     rates: Counter[float] = Counter()

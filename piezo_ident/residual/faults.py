@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the data that a model shows: jitter, outliers, clipping, coarse steps."""
+"""Find faults of the data in a residual: jitter, outliers, clipping, coarse steps."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from piezo_ident.record.record import Fault
 from piezo_ident.residual.stretches import ResidualPart, strokes_of
 from scipy.ndimage import binary_dilation, maximum_filter1d
 
-#: least quantum of a fault, in multiples of the other noise and as a share of the stroke
+#: least step of readings that is a fault, in multiples of the other noise and as share of stroke
 COARSE, COARSE_SHARE = 2.0, 1e-4
-#: the surroundings of an outlier show at most this share of it
+#: largest deviation of a sample around an outlier from a line, as a share of the outlier
 QUIET = 0.35
-#: least samples at the end of a clipped range, deviations by which the model leaves it
+#: fewest clipped samples in a row, and least motion of the model in them, in rms of the noise
 FLAT, LEFT = 5, 6.0
-#: jitter: deviations of the slope, least growth of the variance, blocks of samples
+#: jitter: least slope in its deviations, least growth of the variance, samples in a block
 SURE, GROWTH, CHUNK = 5.0, 1.4, 64
-#: third differences of white noise are anticorrelated by 3/4 from one sample to the next
+#: anticorrelation of neighbouring third differences that counts as white noise, which has 3/4
 WHITE = (0.5, 1.0)
-#: jitter is read from motion whose fast part has at most this share of the scatter's power
+#: largest power of the third differences of the motion, over that of the noise, to read jitter
 SMOOTH = 1.0
 
 
@@ -69,7 +69,7 @@ def find_faults(parts: Sequence[ResidualPart]) -> FaultSearch:
             outliers = _outliers(part, noise, clipped)
             jitter, growth = _jitter(part, noise, clipped | outliers)
             if jitter > 0.0 and outliers.any():
-                # most of them may be readings at the wrong moment
+                # most outliers may be readings at the wrong moment
                 outliers = _outliers(part, noise, clipped, jitter)
             many = float(outliers.mean()) > MAX_WILD
             faults += _masked(part, outliers, clipped, many)
@@ -123,7 +123,7 @@ class _Noise(NamedTuple):
 
 
 def _noise_of(part: ResidualPart) -> _Noise:
-    """Return the fast noise of a part's readings; a model's misfit is too slow to matter."""
+    """Estimate the fast noise of a part; the error of a model is too slow to matter."""
     quantum = quantum_of(part.piece.y)
     rms = white_noise(np.diff(part.e, 3)[part.mask[3:]], quantum)
     rest = float(np.sqrt(max(rms * rms - quantum * quantum / 12.0, 0.0)))
@@ -131,7 +131,7 @@ def _noise_of(part: ResidualPart) -> _Noise:
 
 
 def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.0) -> Mask:
-    """Return single readings far from both neighbours, which agree with each other."""
+    """Mark single readings far from both neighbours, which agree with each other."""
     e = part.e
     height = np.zeros(e.size)
     height[1:-1] = e[1:-1] - 0.5 * (e[:-2] + e[2:])
@@ -165,7 +165,7 @@ def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.
 
 
 def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
-    """Return readings that stay at the largest or smallest value while the model moves on."""
+    """Mark readings that stay at the largest or smallest value while the model moves on."""
     y, y_hat, v = part.piece.y, part.y_hat, part.piece.v
     found = np.zeros(y.size, dtype=bool)
     span = float(np.ptp(v))
@@ -187,12 +187,12 @@ def _clipped(part: ResidualPart, noise: _Noise) -> Mask:
 
 def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, float]:
     """
-    Return the rms scatter of the sampling instants [s], and the growth of the variance by it.
+    Estimate the rms scatter of the sampling instants [s], and how much it raises the variance.
 
     A reading that is late by delta is off by dy/dt delta: the variance of the residual is
     sigma^2 + jitter^2 (dy/dt)^2.  Third differences remove the error of the model in smooth
-    motion.  The rest of that error grows with the third differences of the motion.  They are the
-    second cause in the regression, and blocks with large ones are not used.
+    motion.  The rest of this error grows with the third differences of the motion, which are the
+    second variable of the regression.  Blocks in which they are large are not used.
     """
     e, y_hat, rate = part.e, part.y_hat, part.piece.sample_rate
     third = np.zeros(e.size)
@@ -241,7 +241,7 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
 
 
 def _slope(x: Array, other: Array, y: Array) -> tuple[float, float]:
-    """Return the slope of y over x next to another cause, and its robust standard deviation."""
+    """Fit the slope of y over x beside another variable; also return its robust deviation."""
     scale = max(float(other.max(initial=0.0)), 1e-300)
     A = np.column_stack([x / float(x.max()), np.ones(x.size), other / scale])
     if other.max(initial=0.0) <= 0.0:

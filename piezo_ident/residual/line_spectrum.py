@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stretches of a residual at a lower rate, their transforms, and the noise around a line."""
+"""Compute stretches of a residual at a lower rate, their transforms, and noise around lines."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
 
-#: top of a search as a share of half the averaged rate, and about that rate [Hz]
+#: highest frequency of a search over half of the lower rate, and that rate, approximately [Hz]
 TOP, RATE = 0.8, 2500.0
 #: shortest stretch of a search [s]
 SHORTEST = 0.3
-#: most and fewest neighbours on either side that a line is compared with [bins]
+#: most and fewest bins on either side with which a line is compared
 NEIGHBOURS, FEWEST = 31, 7
-#: least power of a bin of the drive, in multiples of the bins around and of the largest bin
+#: least power of a line of the drive, in multiples of the bins around and of the largest bin
 LOCKED, ROUNDING = 16.0, 1e-12
-#: least gain of differences, or of means, that shows a line
+#: least gain of the differences of periods, or of means, at which a line can show
 FAINT = 0.15
-#: worth of a median of exponential variables, as a share of a mean, as an estimate of their scale
+#: efficiency of a median of exponential variables, over that of a mean, as estimate of their scale
 MEDIAN_WORTH = 0.48
-#: share of the range from which a change of direction counts: noise turns all the time
+#: least motion behind a turn of the voltage, as a share of its range: noise turns all the time
 TURN = 0.01
-#: further points of the grid on either side under a spline of the transform
+#: number of further grid points at either end of a spline of the transform
 WIDER = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
     """
-    A stretch of the residual at the lower rate; differences if the drive repeats.
+    A stretch of the residual at the lower rate; differences of periods if the drive repeats.
 
-    `driven` is power that the drive may have caused, `locked` are the bins of its periods.
+    `driven` is power that the drive may have caused; `locked` marks bins of lines of the drive.
     """
 
     record: str
@@ -55,7 +55,7 @@ class Series:
     locked: Mask | None = None
 
     def gain(self, f: Array) -> NDArray[np.complex128]:
-        """Return the gain of block means and differences for a wave at f."""
+        """Compute the gain of block means and differences for a wave at f [Hz]."""
         x = np.pi * np.asarray(f) / self.rate
         mean = np.where(
             x > 0.0, np.sin(x) / np.maximum(self.block * np.sin(x / self.block), 1e-300), 1.0
@@ -66,9 +66,9 @@ class Series:
 
     def comb(self, f: Array) -> Array:
         """
-        Return the spectrum of differences of white noise, relative to its mean.
+        Compute the spectrum of differences of white noise, relative to its mean.
 
-        Averaging folds higher frequencies back, and the comb has its teeth elsewhere there.
+        Averaging folds higher frequencies back, with the teeth of their comb at other places.
         """
         lag = round(self.lag * self.rate)
         if not 0 < lag < self.x.size:
@@ -86,7 +86,7 @@ class Series:
 def series_of(
     parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
 ) -> tuple[list[Series], float, float]:
-    """Return the stretches that are long enough, their rate, and the highest frequency [Hz]."""
+    """Collect the stretches that are long enough, their rate, and the highest frequency [Hz]."""
     found: list[Series] = []
     rate = max((p.piece.sample_rate for p in parts), default=0.0)
     m = max(1, int(rate / RATE))
@@ -98,9 +98,9 @@ def series_of(
             continue
         start = s.start
         if s.kind == 'rest' and s.step:
-            # the answer to the step is no line
+            # leave out the answer to the step, which is not a line
             start += min(s.n // 5, round(0.1 * rate))
-        # on the ticks of the lower rate, so that stretches of a record differ by whole samples
+        # begin at a tick of the lower rate, so that stretches differ by whole samples of this rate
         first = round(piece.start_time * rate) + start
         start += -first % m
         e = parts[s.part].e[start : s.stop]
@@ -135,7 +135,7 @@ def _series(part: ResidualPart, start: int, x: Array, m: int, period: int = 0) -
 def _motions(
     part: ResidualPart, used: Sequence[tuple[int, int]], m: int, shortest: float
 ) -> list[Series]:
-    """Return the stretches between those used, less the best functions of the drive."""
+    """Collect the stretches between the used stretches, less the best functions of the drive."""
     piece, free = part.piece, part.joined
     for start, stop in used:
         free[start:stop] = False
@@ -183,9 +183,9 @@ def turns_of(v: Array, least: float) -> Integers:
 
 def _locked(v: Array) -> Mask:
     """
-    Return a mask of the bins at which a periodic drive may leave a line, shape (n // 2 + 1,).
+    Mark the bins at which a periodic drive may leave a line, shape (n // 2 + 1,).
 
-    Impulses at its turns have every harmonic, also harmonics at which a mode rings.
+    Impulses at the turns of the drive have every harmonic, also harmonics at which a mode rings.
     """
     turns = turns_of(v, TURN * float(np.ptp(v)))
     signed, plain = np.zeros(v.size), np.zeros(v.size)
@@ -204,10 +204,10 @@ def _locked(v: Array) -> Mask:
 
 def _driven(v: Array, x: Array, window: Array) -> Array:
     """
-    Return the largest power that the drive may have caused in a residual.
+    Bound the power that the drive may have caused in a residual, in each bin.
 
-    The residual gets the spectra of v, its square, its cube, and its direction, which has the
-    harmonics of hysteresis.
+    The bound is the sum of the spectra of v, its square, its cube, and its direction, which has
+    the harmonics of hysteresis; each spectrum has the power of the residual.
     """
     u = v - v.mean()
     power = np.zeros(x.size // 2 + 1)
@@ -222,10 +222,10 @@ def _driven(v: Array, x: Array, window: Array) -> Array:
 @dataclass(frozen=True, eq=False)
 class Spectrum:
     """
-    Windowed transform of a series on a grid of frequencies, from a time that all series share.
+    Windowed transform of a series on a grid of frequencies; all series share the time zero.
 
-    `noise` is the mean square of the transform around each frequency without a line, `worth` the
-    number of averages in it; shapes (p,).
+    `noise` is the mean square of the transform around each frequency without a line, and `worth`
+    the number of independent bins in this mean; shapes (p,).
     """
 
     series: Series
@@ -235,7 +235,7 @@ class Spectrum:
 
     @classmethod
     def of(cls, s: Series, f: Array, size: int) -> Spectrum:
-        """Return the spectrum on the first frequencies of a transform of some size."""
+        """Compute the spectrum at the frequencies f, the first of a transform of `size` points."""
         x, offset = s.window * s.x, s.offset % size
         # on the grid a stretch may be put anywhere modulo its size
         placed = np.zeros(size)
@@ -246,7 +246,7 @@ class Spectrum:
 
     def between(self, f: Array, near: Integers) -> Callable[[Array], NDArray[np.complex128]]:
         """
-        Return the transform as a function of any frequency [Hz] near some points of the grid f.
+        Interpolate the transform at any frequency [Hz] near some points of the grid f.
 
         The transform is smooth if time counts from the middle of the stretch.  A spline of fifth
         degree errs by 1e-5 of the maximum for the longest stretch, and by far less for others.
@@ -263,11 +263,11 @@ class Spectrum:
 
 def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
     """
-    Return the mean square of the transform around each f without a line, and its averages.
+    Estimate `noise` and `worth` of a `Spectrum`.
 
     The geometric mean of the medians on both sides leaves a power law as it is.  Differences over
-    a lag make a comb of the noise, as deep as the window overlaps itself shifted by that lag.
-    Power of a drive that does not repeat counts as noise.
+    a lag make a comb of the noise, as deep as the window overlaps the window shifted by this lag.
+    Power that a drive without periods may have caused counts as noise.
     """
     rate = s.rate
     power = np.abs(fft.rfft(s.window * s.x)) ** 2
@@ -277,7 +277,7 @@ def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
     logs = np.log(np.maximum(power, tiny))
     level, worth = np.full(power.size, np.inf), np.ones(power.size)
     half = FEWEST
-    # the window makes three bins of one, so the next three belong to the line itself
+    # the Hann window spreads a line over three bins, and the line may lie between two bins
     gap = 4
     while True:
         sides = median_filter(logs, size=half, mode='nearest')
@@ -296,8 +296,8 @@ def _noise_around(s: Series, f: Array) -> tuple[Array, Array]:
         level = np.maximum(level, s.driven)
     if s.locked is not None:
         level = np.where(s.locked, np.inf, level)
-    # a record without any noise must not make a line of its rounding
+    # rounding must not count as a line in a record without noise
     least = max(np.finfo(float).eps ** 2 * float(power.max(initial=0.0)), 1e-40)
     level = np.maximum(level[at], least) * s.comb(f)
-    # periods of no whole number of samples leave something of themselves in the differences
+    # a period that is no whole number of samples leaves a rest of the drive in the differences
     return np.where(np.abs(s.gain(f)) < FAINT, np.inf, level), worth[at]

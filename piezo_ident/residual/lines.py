@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Narrow lines in a residual that the drive did not make: hum, its harmonics, any other source.
+Find narrow lines in a residual that the drive did not cause: hum, its harmonics, other sources.
 
 The best common sine of all stretches is tested against its neighbours, as by Fisher (1929), Proc.
 R. Soc. A 125, 54-59, doi:10.1098/rspa.1929.0151.  Each stretch is weighted by its own noise around
@@ -27,18 +27,18 @@ from scipy.special import gammaincc, gammaln
 LINES = 6
 #: chance of one false line in a search
 SIGNIFICANT = 1e-3
-#: least line as a share of the stroke, as converters make smaller lines, and of the residual, as a
-#: motion that is nearly locked to the drive makes smaller lines
+#: least amplitude of a line as a share of the stroke, as converters make smaller lines, and of the
+#: residual, as motion that is nearly locked to the drive makes smaller lines
 SMALLEST, SIDELINE = 1e-5, 0.01
-#: points of the common grid in one bin of the whole search
+#: points of the common grid in one bin of the whole time of a search
 FINE = 2.5
 #: independent trials in one bin: the largest score is mostly between two bins (white noise)
 TRIALS = 4.0
 #: least share of the amplitude of a line in each half of the data
 STEADY = 0.5
-#: least gain on the grid near a line, as a share of the largest gain
+#: least maximum of the gain near a line that is refined, as a share of the largest gain
 LOBE = 0.4
-#: two lines of similar size (this share) and frequency (this share) are a resonance that rings
+#: two lines ring as one mode if their amplitudes (this ratio) and frequencies (share) are alike
 COMPARABLE, BESIDE = 0.5, 0.02
 #: harmonics that are grouped under their base
 HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
@@ -47,10 +47,10 @@ HARMONICS = (2, 3, 4, 5, 6, 7, 8, 9)
 @dataclass(frozen=True)
 class Line:
     """
-    One narrow line [Hz], and its largest amplitude over the records [m].
+    One narrow line [Hz], with its largest amplitude over the records [m].
 
-    The harmonics have their orders; `records` are (record, amplitude [m], phase [rad] of the sine
-    at time zero of the record).
+    `harmonics` are (order, line); `records` are (record, amplitude [m], phase [rad] of the sine at
+    time zero of the record).
     """
 
     frequency: float
@@ -71,8 +71,8 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     """
     Search residuals of one sampling rate for narrow lines that are not locked to the drive.
 
-    Residuals of consecutive periods of a repeating v are subtracted.  The difference holds nothing
-    that the drive makes, and lines of other frequencies with a known gain.
+    Where v repeats, the residuals of consecutive periods are subtracted.  Their difference holds
+    nothing that the drive causes, and lines of other frequencies with a known gain.
     """
     series, rate, high = series_of(parts, stretches)
     if not series:
@@ -92,7 +92,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
     found: list[Line] = []
     score, gain = search.score()
     for _ in range(2 * LINES):
-        # strong lines are significant at their neighbours, too: the largest gain is the line
+        # a strong line is significant beside its frequency, too: the largest gain is the line
         significant = keep & (bins * np.exp(-score) <= SIGNIFICANT)
         if len(found) == LINES or not significant.any():
             break
@@ -128,7 +128,7 @@ class _Search:
         self.records = sorted({s.record for s in series})
 
     def without(self, line: Line) -> _Search:
-        """Return the search with a line subtracted."""
+        """Subtract a line from all series."""
         sines = {name: (amplitude, phase) for name, amplitude, phase in line.records}
         series = []
         for spectrum in self._spectra:
@@ -142,7 +142,7 @@ class _Search:
 
     def score(self) -> tuple[Array, Array]:
         """
-        Return -ln of the chance under noise alone for every f, and the gain.
+        Compute -ln of the chance under noise alone for every f, and the gain.
 
         The gain is the sum of weighted squares that a sine explains, and has its maximum at the
         frequency of the line.  The chance depends on the uncertainty of the noise there, too.
@@ -173,11 +173,11 @@ class _Search:
 
     def refined(self, best: int) -> float:
         """
-        Return the frequency of the least squared error around a grid point, with its noise.
+        Find the frequency of the least squared error near a grid point, with the noise there.
 
-        A strong line counts as noise of the bins beside it, and the minimum of that noise is not
-        the frequency of the line.  Stretches far apart agree nearly as well at many frequencies
-        between two points of the grid.
+        The noise of one point is used, as a strong line counts as noise of the bins beside it.
+        Stretches far apart agree nearly as well at many frequencies between two points of the
+        grid, so every maximum is refined.
         """
         power = [abs(s.values[best]) ** 2 / s.noise[best] for s in self._spectra]
         series = self._spectra[int(np.argmax(power))].series
@@ -199,7 +199,7 @@ class _Search:
         return float(centres[np.argmax(gain(centres))])
 
     def _gains(self, f: Array, values: Sequence[NDArray[np.complex128]], best: int) -> Array:
-        """Return the weighted squares that a sine at f explains, by the transforms there."""
+        """Compute the weighted squares that a sine at f explains, by the transforms there."""
         gains = np.zeros(f.size)
         for name in self.records:
             top, information = np.zeros(f.size, np.complex128), np.zeros(f.size)
@@ -212,12 +212,12 @@ class _Search:
         return gains
 
     def sine(self, frequency: float, record: str, best: int) -> tuple[float, float]:
-        """Return amplitude and phase of A sin(2 pi f t + phase)."""
+        """Fit amplitude and phase of A sin(2 pi f t + phase) to a record."""
         a, _ = self._fit(frequency, record, best)
         return float(abs(a)), float(np.angle(1j * a))
 
     def is_steady(self, frequency: float, best: int) -> bool:
-        """Return whether both halves of the stretches have the same sine, unlike a transient."""
+        """Tell whether both halves of the stretches hold the same sine, unlike a transient."""
         for name in self.records:
             whole, information = self._fit(frequency, name, best)
             if abs(whole) ** 2 * information < 12.0:
@@ -233,7 +233,7 @@ class _Search:
         self, frequency: float, record: str, k: int, half: int | None = None
     ) -> tuple[complex, float]:
         """
-        Return the best common amplitude of a record's stretches, and its information.
+        Fit the common complex amplitude of a record's stretches; also return its information.
 
         The noise is taken at index k; stretches with a faint gain do not count.
         """
@@ -257,7 +257,7 @@ class _Search:
 
 
 def _log_chance(total: Array, n: int) -> Array:
-    """Return -ln of the chance that a sum of n exponential variables exceeds a total."""
+    """Compute -ln of the chance that a sum of n exponential variables exceeds a total."""
     if n == 1:
         return total
     p = gammaincc(n, total)
@@ -284,7 +284,7 @@ def _grouped(found: Sequence[Line], width: float) -> tuple[Line, ...]:
 
 
 def without_lines(part: ResidualPart, lines: Sequence[Line]) -> ResidualPart:
-    """Return a part without the lines of its record and their harmonics."""
+    """Subtract from a part the lines of its record and their harmonics."""
     e, t = part.e.copy(), part.piece.t if lines else np.zeros(0)
     for base in lines:
         for line in (base, *(harmonic for _, harmonic in base.harmonics)):

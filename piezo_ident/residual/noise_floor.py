@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The noise floor of a residual: its part that differs from one equal drive to the next."""
+"""Estimate the noise floor of a residual: the part that differs between equal motions."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from scipy import signal
 ORDER = 3
 #: shortest frame [s]: slower changes count as drift
 FRAME = 0.25
-#: share at the start of a rest that is left out, and least time of it [s]
+#: share at the start of a rest that is left out, and least time that is left out [s]
 SETTLING, SETTLING_TIME = 0.2, 0.02
-#: least share of the rms of a white residual in its third differences, and fewest samples of it
-#: (level of the test: the estimate then scatters by 2 %)
+#: least ratio of the rms of a white residual by its third differences to its whole rms, and fewest
+#: samples (level of the test: the estimate then scatters by 2 %)
 WHITE, FEWEST = 0.95, 2000
 #: longest block of a table of block lengths [samples]
 LONGEST_BLOCK = 4096
-#: a line of the spectrum over its surroundings: white noise exceeds this once in e^10 bins; and
-#: the bins an octave at which the surroundings are measured, over two octaves (taste)
+#: least power of a line over its surroundings, which white noise exceeds once in e^10 bins; and
+#: number of places in an octave at which the surroundings are measured, over two octaves (taste)
 LINE, AN_OCTAVE = 10.0, 4
 
 
@@ -35,7 +35,7 @@ class NoiseFloor:
     """
     Noise that no model of the voltage can explain.
 
-    `rms` is that of single samples [m], None if it is unknown; `source` says how it was read.
+    `rms` is the rms of single samples [m], None if it is unknown; `source` tells its origin.
     `block_rms` is the rms of means [m] over `blocks` of 1, 2, 4, ... samples, shapes (k,).  The
     power spectral `density` [m^2/Hz] over `frequency` [Hz], shapes (p,), may be empty.
     """
@@ -54,15 +54,15 @@ class NoiseFloor:
 
     def at(self, m: float) -> float | None:
         """
-        Return the rms of the noise in means over blocks of m samples [m], None if unknown.
+        Compute the rms of the noise in means over blocks of m samples [m], None if unknown.
 
-        A power law interpolates between the measured block lengths.  The mean slope of the last
-        two octaves goes on beyond the longest.
+        A power law interpolates between the measured block lengths.  Longer blocks continue the
+        mean slope of the last two octaves.
         """
         if self.rms is None:
             return None
         if self.rms == 0.0 or self.blocks.size < 2:
-            return float(self.rms) / float(np.sqrt(m) if self.blocks.size < 2 else 1.0)
+            return float(self.rms / np.sqrt(m))
         x = np.log(self.blocks.astype(np.float64))
         y = np.log(np.maximum(self.block_rms, np.finfo(float).tiny))
         at = float(np.log(m))
@@ -74,7 +74,7 @@ class NoiseFloor:
 
     def squares(self, quantum: float, m: int, span: float) -> tuple[float, float | None]:
         """
-        Return the mean squares in a row of m samples and in one, normalised by a span [m].
+        Compute the mean squares of means over m samples and of samples, in units of a span [m].
 
         The second is None if the floor is unknown; `quantum` is the step of the readings [m].
         """
@@ -99,14 +99,14 @@ def residual_noise_floor(
     parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
 ) -> NoiseFloor:
     """
-    Return the noise floor of residuals.
+    Estimate the noise floor of residuals.
 
     The difference of two consecutive periods of a repeating v, from the second period on, has
     twice the variance of the noise.  The error of the model repeats and drops out; slow drift is
     subtracted, and lines of the spectrum are lowered.  Records without repeats use rests, less
     parabolas in time and in the logarithm of time, which describe creep.  The weighted median over
-    the stretches counts, so that a settling stretch does no harm.  A residual without repeats and
-    rests is noise if it is white throughout: the error of a model has a memory.  Noise slower than
+    the stretches counts, so that a settling stretch hardly matters.  Without repeats and rests, a
+    white residual is noise, because the error of a model is correlated in time.  Noise slower than
     a period or a rest counts as drift.
 
     Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012),
@@ -121,7 +121,7 @@ def residual_noise_floor(
 
 
 def _white(parts: Sequence[ResidualPart]) -> NoiseFloor:
-    """Return the floor of a white residual, whose third differences show all of its power."""
+    """Estimate the floor of a white residual, whose third differences show all of its power."""
     own = [part.e[part.mask] - part.e[part.mask].mean() for part in parts if part.mask.any()]
     third = [
         np.diff(part.e, 3)[np.lib.stride_tricks.sliding_window_view(part.mask, 4).all(axis=1)]
@@ -157,17 +157,17 @@ def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
         return None
     t = (np.arange(n) + skip + 1.0) / s.n
     lg = np.log(t)
-    # a few relaxations are no exact logarithm; the squares bend towards them
+    # the squares follow creep that is not an exact logarithm of time
     basis = np.column_stack([np.ones(n), t, t * t, lg, lg * lg])
     series = _detrended(part.e[s.start + skip : s.stop], n, basis)
-    # a mode that rings starts at once, and would be in every bin of the spectrum
+    # without a window a mode that rings from the start would leak into every bin
     window = np.hanning(n + 2)[1:-1]
     series *= window / np.sqrt(np.mean(window**2))
     return _reading(part, series, n, n // 16, basis.shape[1])
 
 
 def _detrended(x: Array, frame: int, basis: Array) -> Array:
-    """Return the whole frames of x without their projections on a basis."""
+    """Subtract from each whole frame of x its projection on a basis."""
     rows = x[: x.size // frame * frame].reshape(-1, frame)
     q, _ = np.linalg.qr(basis)
     return np.asarray((rows - (rows @ q) @ q.T).ravel())
@@ -185,14 +185,14 @@ def _reading(
     for m in 2 ** np.arange(top + 1):
         count = frame // m
         means = rows[:, : count * m].reshape(rows.shape[0], count, m).mean(axis=2)
-        # the median of several frames: drift may have bent one of them
+        # the median of several frames, as drift may have bent one frame
         power = np.sum(means**2, axis=1) / max(count - removed, 1)
         variances.append(float(np.median(power) if power.size > 2 else power.mean()))
     return _Reading(series, part.piece.sample_rate, np.array(variances))
 
 
 def _without_ringing(x: Array) -> Array:
-    """Lower the lines of a spectrum to its surroundings: a mode that rings on is no noise."""
+    """Lower the lines of a spectrum to its surroundings: a mode that rings is not noise."""
     X = np.fft.rfft(x)
     power, n = np.abs(X[1:]) ** 2, X.size - 1
     at = np.unique(np.geomspace(1, n, AN_OCTAVE * int(np.log2(n)) + 2).astype(int))
@@ -204,13 +204,13 @@ def _without_ringing(x: Array) -> Array:
 
 
 def _pooled(readings: Sequence[_Reading], kind: str) -> NoiseFloor:
-    """Return the floor by the median of readings, weighted by their samples."""
+    """Take the median of readings, weighted by their samples."""
     longest = max(r.variances.size for r in readings)
     medians = []
     for i in range(longest):
         known = sorted((r.variances[i], r.series.size) for r in readings if r.variances.size > i)
-        behind = np.cumsum([size for _, size in known])
-        medians.append(known[int(np.searchsorted(behind, 0.5 * behind[-1]))][0])
+        total = np.cumsum([size for _, size in known])
+        medians.append(known[int(np.searchsorted(total, 0.5 * total[-1]))][0])
     # averaging never adds noise
     block_rms = np.sqrt(np.minimum.accumulate(medians))
     widest = max(readings, key=lambda r: r.series.size)

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A residual with its record, cut into rests, repeating stretches and the rest of the motion."""
+"""Cut a residual with its record into rests, repeating stretches and other motion."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from piezo_ident.record.record import Piece, Segment
 from scipy import fft
 from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-#: shortest rest [s], [samples]: a shorter one belongs to the motion around it
+#: shortest rest [s], [samples]: a shorter rest belongs to the motion around it
 REST_TIME, REST_SAMPLES = 0.05, 200
-#: least share of the differences of a measured voltage at rest that reverse the difference before
+#: least share of the differences of a measured voltage that change their sign, at rest
 TREMBLE = 0.3
 #: a voltage that repeats comes back within this share of its range
 COMES_BACK = 2e-3
 #: closer repeats count as exact, and the shorter period is taken
 EXACT = 1e-4
-#: least periods behind the first, which may still be settling
+#: fewest periods behind the first period, which may still be settling
 PERIODS = 2
-#: share of a period that may be missing: a rest may have taken a sample of it
+#: share of a period that may be missing, as a rest may have taken a sample of the period
 SLACK = 0.02
 #: tried candidates for the period in every octave
 CANDIDATES = 3
@@ -42,8 +42,8 @@ class ResidualPart:
 
     `e` is measured minus simulated displacement, free run [m], shape (n,).  `sound` is False for
     bridged and lost samples, and while the memory of the start matters.  `e` is a straight line
-    over a few samples in a row that are not sound.  DataError if the lengths differ, or a sound
-    residual is not finite.
+    over a few samples in a row that are not sound.  Raises DataError if the lengths differ, or a
+    sound residual is not finite.
     """
 
     record: str
@@ -79,7 +79,7 @@ class ResidualPart:
         return np.asarray(self.piece.y - self.e)
 
     def with_residual(self, e: Array) -> ResidualPart:
-        """Return the same part with another residual."""
+        """Replace the residual of the part."""
         return ResidualPart(self.record, self.piece, e, self.sound)
 
     @property
@@ -88,7 +88,7 @@ class ResidualPart:
         return closed(self.mask, FEW)
 
     def runs(self) -> list[tuple[int, int]]:
-        """Return start and stop of the runs of `joined` samples."""
+        """Find start and stop of the runs of `joined` samples."""
         return true_runs(self.joined)
 
 
@@ -114,19 +114,19 @@ class Stretch:
 
 
 def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
-    """Return ``max y - min y`` of each record over all its parts [m]."""
+    """Compute ``max y - min y`` of each record over all its parts [m]."""
     return strokes((part.record, part.piece.y) for part in parts)
 
 
 def block_means(x: Array, m: int) -> Array:
-    """Return the means of whole blocks of m samples, shape (n // m,)."""
+    """Compute the means of whole blocks of m samples, shape (n // m,)."""
     n = x.size // m
     # a product with a vector is several times faster than a mean along a short axis
     return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
 def all_stretches(parts: Sequence[ResidualPart]) -> list[Stretch]:
-    """Return the stretches of all parts with the numbers of their parts."""
+    """Cut all parts into stretches, with the numbers of their parts."""
     return [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
 
 
@@ -161,7 +161,7 @@ def _shortest(rate: float) -> int:
 
 def rests(v: Array, rate: float) -> list[tuple[int, int]]:
     """
-    Return the first repeated sample and the end of each rest of a voltage.
+    Find the first repeated sample and the end of each rest of a voltage.
 
     A voltage at rest is constant but for the noise of its measurement; `rate` is in Hz.
 
@@ -176,14 +176,14 @@ def rests(v: Array, rate: float) -> list[tuple[int, int]]:
         turns = np.concatenate([[False], d[1:] * d[:-1] < 0.0])
         trembling = uniform_filter1d(turns.astype(np.float64), window) > TREMBLE
         narrow = maximum_filter1d(v, window) - minimum_filter1d(v, window) < COMES_BACK * span
-        # a window within the rest covers half a window to either side
+        # a window within a rest covers half its width to either side of its middle
         inside = binary_dilation(trembling & narrow, iterations=window // 2)
         still = inside & (np.abs(d) < COMES_BACK * span)
     return true_runs(still)
 
 
 def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list[Stretch]:
-    """Return the repeating stretches of a motion, and the stretches between them."""
+    """Cut a motion into repeating stretches, and the stretches between them."""
     if stop - start < shortest:
         return []
     found, edge = [], start
@@ -199,13 +199,13 @@ def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list
 
 def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
     """
-    Return the repeats of a signal in order: (start, stop, period) [samples].
+    Find the repeats of a signal in order: (start, stop, period) [samples].
 
     A candidate is a minimum of the mean square difference between the signal and the shifted
     signal, behind the first maximum of that difference: de Cheveigne and Kawahara (2002), J.
     Acoust. Soc. Am. 111, 1917-1930, doi:10.1121/1.1458024.  Each candidate is then compared sample
-    by sample, so that other motion before and after does no harm.  A repeat has three periods at
-    least.  Motions of several periods hide each other: without a repeat, both halves are searched.
+    by sample, so that motion before and after does not hide it.  A repeat has three periods or
+    more.  Motions of several periods hide each other: without a repeat, both halves are searched.
     """
     span = float(np.ptp(v))
     if v.size < 3 * 8 or span == 0.0:
@@ -223,7 +223,7 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
         if matching:
             miss = max(float(np.sqrt(np.mean(difference[a:b] ** 2))) for a, b in matching)
             tried.append((miss / span, period, matching))
-    # the best repeat first; the shortest of about equal ones
+    # the best repeat first; of about equal repeats, the shortest period first
     least = max(EXACT, 1.5 * min((miss for miss, _, _ in tried), default=0.0))
     tried.sort(key=lambda one: (max(one[0], least), one[1]))
     taken = np.zeros(v.size, dtype=bool)
@@ -244,7 +244,7 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
 
 def _candidates(v: Array) -> list[int]:
     n, x = v.size, v - v.mean()
-    # two more, so that the longest period is an inner minimum
+    # two more lags, so that the longest period is an inner minimum
     longest = n // (PERIODS + 1) + 2
     size = fft.next_fast_len(n + longest + 1, real=True)
     spectrum = fft.rfft(x, size)
@@ -259,8 +259,8 @@ def _candidates(v: Array) -> list[int]:
     behind = int(np.argmax(d > 0.2 * top))
     minima = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] < d[2:])) + 1
     minima = minima[(minima > behind) & (d[minima] < 0.8 * top)]
-    # a short period of no whole number of samples repeats exactly at its multiples, and a signal
-    # may have both periods in turn: the best of every octave are tried
+    # a short period that is no whole number of samples repeats exactly at a multiple, and a signal
+    # may have a short and a long period in turn: the best of every octave are tried
     octave = np.floor(np.log2(np.maximum(minima, 1)))
     chosen: set[int] = set()
     for k in np.unique(octave):
