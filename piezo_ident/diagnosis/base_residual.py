@@ -47,10 +47,10 @@ from piezo_ident.residual.faults import FaultSearch
 HUM = 'periodic_disturbance'
 #: share of the voltage range within which the command counts as resting with noise
 TREMBLES = 0.01
-#: a larger unexplained share of its variance shows a displacement that ignores the voltage
+#: the displacement ignores the voltage if a fitted H leaves more than this share of its variance
 UNRELATED = 0.99
-#: the displacement runs against the model if their correlation is lower; no change of a stage
-#: causes this
+#: the displacement runs against the model if their correlation is lower.  No change of a stage
+#: turns its direction
 AGAINST = -0.9
 
 
@@ -110,7 +110,7 @@ class BaseResidual:
 
     @property
     def tested(self) -> set[str]:
-        """Effects whose own tests had something to search; nothing of them is left to fit."""
+        """Effects whose own tests could search these data, so that no candidate is needed."""
         found = {HUM} if self.lines.searched else set()
         return found | ({'cross_coupling'} if any(test.tells for test in self.channels) else set())
 
@@ -129,7 +129,7 @@ def base_residual(simulator: Simulator, faults: FaultSearch) -> BaseResidual:
     noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
     # the estimated noise is too large while a memory settles: periods then differ.  No model errs
-    # by less than the noise, so the smallest error bounds it
+    # by less than the noise, so the smallest error bounds the noise
     excess = max(noise - min(left, plays.mean_square, wide.mean_square), 0.0)
     single = None if single is None else single - excess
     missed, noise = missed_now(simulator), noise - excess
@@ -166,7 +166,7 @@ def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:
     """Raise IdentificationError if the displacement does not follow the voltage."""
     rows = simulator.rows
     swing = max(float(np.ptp(run.u)) for run in rows.runs)
-    # other disturbances may be larger if the voltage only trembles
+    # disturbances may exceed the answer to a voltage that only trembles
     if swing <= TREMBLES:
         return
     names = ', '.join(rows.names)
@@ -188,7 +188,7 @@ def missed_then(model: StageModel) -> float:
     known = _entries(model, 'errors')
     if 'fast_motion' in known:
         known = {'fast_motion': known['fast_motion']}
-    # a file without this entry holds the error on all motion
+    # a file without this entry has the error on all motion
     return max((float(x) for x in known.values() if isinstance(x, int | float)), default=0.0)
 
 

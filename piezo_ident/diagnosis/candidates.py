@@ -28,7 +28,7 @@ from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.trial_scores import TrialColumns
 from piezo_ident.effects import Effect, find_effect
 
-#: a candidate is fitted on only if it may reach this share of the error of the best smaller set
+#: a fit goes on only while it may reach this share of the error of the best smaller set
 PROMISING = 0.9
 #: number of sets to which one more effect is added: of sets with one effect, and of larger sets
 EXTENDED = 2, 1
@@ -52,7 +52,7 @@ class CandidateSearch:
         self._simulator, self._residual, self._rng, self._tick = simulator, residual, rng, tick
         have = [find_effect(setting.name) for setting in simulator.model.effects]
         knows_path = any(effect.rate_independent for effect in have)
-        # a change of a known effect of the path would look like another such effect
+        # a change of a known effect of the path would look like another effect of the path
         self._effects = [
             effect
             for effect in map(find_effect, effects)
@@ -87,7 +87,7 @@ class CandidateSearch:
         for base in _worth_searching(candidates):
             some, goal = self._effects, PROMISING * least
             if base is not best and not base.retunes:
-                # the effect must do most of the work of a refit
+                # the effect must lower the error nearly as much as a refit of H
                 some, goal = path, least + TAKES * max(candidates.left(base) - least, 0.0)
             candidates = candidates.and_these(self._with_each(base, some, goal))
         candidates = self._in_all_ways(candidates, 1)
@@ -128,7 +128,7 @@ class CandidateSearch:
         for c in candidates.of(()):
             if c.way not in {'given', *have, *found}:
                 found[c.way] = tried(refit_of, simulator, state, law_of(c.fitted), goal)
-        # an effect that runs away beside one H may hold beside another
+        # the fit of an effect may diverge beside one H and converge beside another H
         more = [replace(best, way=way, fitted=one) for way, one in found.items() if one]
         last = min(more, key=candidates.left, default=best)
         if simulator.is_fast and not (change_g(best.effects) or last.retunes):
@@ -164,7 +164,7 @@ class CandidateSearch:
         self.rounds.append(this)
         return [
             FittedSet(tuple(sorted((*base.effects, fitted.name))), base.way, fitted, this)
-            # creep from earlier motion shows only beside the effect that was missing
+            # creep from earlier motion shows only once the missing effect is in the model
             for fitted in (with_earlier_motion(self._simulator, one) for one in this.contenders)
         ]
 

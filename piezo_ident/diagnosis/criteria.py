@@ -20,7 +20,7 @@ SMALLEST_EFFECT = 0.05
 #: a change of G must exceed the error of G at its identification.  The error grows by this share
 #: of the growth of the fast motion: the rest of it was small loops, not G
 IN_PROPORTION = 0.5
-#: the zero of the sensor has moved if the mean error of a record is so many times the other error
+#: the zero of the sensor has moved if the mean error of a record is so many times its other error
 MOVED_ZERO = 3.0
 
 # -- statistics ----------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import find_effect
 
-#: effect of minor loops that the H of any material shows a little
+#: effect that any material shows a little, as its minor loops are never quite congruent
 OF_MATERIALS = 'noncongruent_minor_loops'
 
 
@@ -202,7 +202,7 @@ class Candidates:
         return self.left(self.as_given)
 
     def like_refit(self) -> tuple[FittedSet, ...]:
-        """Return the effects of the path that do most of the work of a refit; the best first."""
+        """List effects of the path that gain most of what a refit gains, the best first."""
         given, refit = self.given, self.left(self.without())
         if given - refit < self.rows.square(SMALLEST_EFFECT) or self.rows.passes < PASSES:
             return ()

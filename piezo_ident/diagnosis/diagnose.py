@@ -95,7 +95,7 @@ def diagnose(
     ]
     if not is_whole:
         warnings.append(part_searched(records, part))
-    # faults found by the reader are reported there, not here
+    # the reader has reported the faults that it found
     lost = (
         replace(fault, where=f'in {record.name}, {fault.where}')
         for record, sound in zip(records, measured, strict=True)
@@ -250,7 +250,7 @@ def _residuals(
 ) -> tuple[Residual, ...]:
     """Compute the residuals of each piece as given, before, and after the refinement [m]."""
     runs, Y = simulator.rows.runs, simulator.model.scaling.Y
-    # behind a refit without effects, the refined model is the model before effects, too
+    # if no effect was added, the refitted base model is the refined model
     is_refit = not refined.is_given and not refined.state.effects
     before = refined.state if is_refit else without
     full = [simulator.full(state) for state in (given, before, refined.state)]

@@ -45,7 +45,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """Normal equations of other information, shapes (p, p) and (p,); present sum of squares."""
+    """Normal equations of information besides the rows, (p, p) and (p,), and sum of squares."""
 
     A: Array
     b: Array
@@ -98,7 +98,7 @@ def solve(A: Array, b: Array, prior: Array) -> Array:
     The diagonal grows by the prior, shape (p,), and by `RIDGE` times the energy of each column.
     Singular equations raise IdentificationError.
     """
-    # a column may live in one set alone; rounding then leaves a slightly negative energy
+    # a column may be nonzero in one set alone; rounding then leaves a slightly negative energy
     size = np.sqrt(np.maximum(np.diag(A), 0.0))
     size = np.where(size > 0.0, size, 1.0)
     scaled = A / np.outer(size, size)

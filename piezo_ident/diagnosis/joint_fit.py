@@ -231,8 +231,7 @@ class _Fit:
         pull_at: Callable[[State, int], Pull] | None,
     ) -> None:
         rows = simulator.rows
-        # a fixed H, or an H that is drawn to the given one, leaves changes of its gain to the
-        # effects
+        # a fixed H, or an H that is drawn to the given H, leaves changes of its gain to effects
         free_h = state.law is not None and pull_at is None
         self._parameters = free_parameters(
             state, len(rows.names), rows.longest if free_h else None
@@ -242,7 +241,7 @@ class _Fit:
         self._damping = DAMPING
         self.state, self.base = state, base
         self.e = rows.x - simulator.remember(state)
-        self._given = pull_at and pull_at(state, self._p)
+        self._known = pull_at and pull_at(state, self._p)
         self.linearise()
 
     def linearise(self) -> None:
@@ -250,7 +249,7 @@ class _Fit:
         state, parameters = self.state, self._parameters
         self._moving = _derivatives(self._simulator, state, parameters, self._tick)
         self._prior = prior_of(self._simulator.rows, self.e, self._p, state, parameters)
-        self._pull = with_known(state, parameters, self._prior, self._given)
+        self._pull = with_known(state, parameters, self._prior, self._known)
         self.loss = _loss(self.e, self._pull)
 
     def step(self, least: float) -> float:
@@ -280,7 +279,7 @@ class _Fit:
             gain = self.loss - _loss(left, with_known(trial, parameters, self._prior, new))
             if gain > 0.0:
                 self._damping = max(self._damping * next_damping(gain / promised), LEAST_DAMPING)
-                self.state, self.e, self._given = trial, left, new
+                self.state, self.e, self._known = trial, left, new
                 self.loss -= gain
                 return promised
             self._damping *= WORSE ** (failed + 1)

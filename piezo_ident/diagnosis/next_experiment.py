@@ -4,10 +4,10 @@
 """
 Suggest the next experiment: the excitation that answers the questions these data leave open.
 
-Each effect shows in some motions and hides in others.  Some effects imitate each other if a
-certain motion is missing.  Example: creep lowers the slope of the loop at low frequencies less and
-less as the frequency rises, and so do thresholds that grow with the speed.  The suggestion names
-motions that separate the doubtful effects and that the data lack.
+Each effect shows in some motions and hides in others.  Some effects imitate each other if one
+kind of motion is missing.  Example: the slope of a loop falls as the frequency rises, with creep
+as with thresholds that grow with the speed.  The suggestion names motions that separate the
+doubtful effects and that the data lack.
 """
 
 from __future__ import annotations

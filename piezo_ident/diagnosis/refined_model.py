@@ -64,7 +64,7 @@ def refine(
     shifts = moved_zeros(rows, given, e)
     if h_is_given and not findings.effects:
         return Refined(model, given, shifts * model.scaling.Y, is_given=True, h_is_given=True)
-    # beside an effect that was found, a smaller shift is visible, too
+    # with the effects in the model, smaller shifts are visible
     hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
     shifts = np.where(shifts == 0.0, hidden, shifts)
     state = replace(fitted.state, offsets=fitted.state.offsets - shifts)
@@ -99,9 +99,9 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
     An effect that the given model lacks can imitate a shift.  Two estimates must therefore agree
     in sign: the mean error of the given model, and the displacement at rest relative to the given
     model.  An effect that already acted during the identification distorts at most one of the two.
-    The smaller estimate counts.  It must exceed `MOVED_ZERO` times the remaining error or the
-    expected error of the given model.  The error of the given model is enough.  `before` holds the
-    mean square of that error in each record, shape (records,).
+    The smaller estimate counts.  It must exceed `MOVED_ZERO` times an error: the larger of the
+    remaining error and the expected error of the given model, or the actual error of the given
+    model if that is less.  `before` is the mean square of the actual error, shape (records,).
     """
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))

@@ -40,7 +40,7 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 #: a new numerator of G begins so many samples earlier, as the delay may have imitated the effect.
 #: Its fewest taps: a mode needs three, and a filter behind the mode needs one (physics)
 EARLIER, LEAST_TAPS = 3, 4
-#: laws of H that are wider than plays: one with loops that are not congruent, one with lags, too
+#: laws of H wider than plays: the loops of the first are not congruent, the second also has lags
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
 
 
@@ -260,7 +260,7 @@ SWEEP = 60
 
 
 def loops(low: float, high: float) -> Array:
-    """Return a motion from `low` through loops that hang from both ends, and some between."""
+    """Compute a motion from `low` through loops from both ends of a range, and loops between."""
     turns = [0.0]
     for level in np.arange(1, 7) / 6:
         turns += [level, 0.0]

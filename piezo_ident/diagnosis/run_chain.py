@@ -140,7 +140,7 @@ class RunChain:
     def slopes(self, effect: type[Effect], blocks: Sequence[Block]) -> Mapping[str, Array]:
         """Compute the derivatives that an effect around H knows itself, on kept blocks."""
         core = place_of_core(self.operators)
-        # each of these effects adds to H of one input, so no effect follows another
+        # all effects around H add to H of the same input, so no slope passes another effect
         around = [one for one in effects_around(self.operators[core]) if type(one) is effect]
         return around[0].slopes(blocks[core]) if around else {}
 

@@ -56,8 +56,8 @@ WORTH_END = 0.5
 #: trials of a candidate that start a joint fit, iterations of this fit, and candidates of a round
 #: that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: multiples of an error: a trial beside plays is a start up to this multiple of the error before.
-#: Beyond these multiples of the best error, another start and another candidate are given up
+#: a trial beside plays is a start up to this multiple of the error before.  Another start, and
+#: another candidate, is given up beyond the next two multiples of the best error
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
@@ -147,7 +147,7 @@ def search_round(
 
 
 def _surrogates(e: Array, rng: np.random.Generator) -> Array:
-    """Shift a residual in time so that nothing of it is left in place; shape (n, surrogates)."""
+    """Shift a residual circularly, by a twentieth of its length or more; shape (n, surrogates)."""
     n = e.size
     shifts = rng.integers(n // 20, n - n // 20, 4 * SURROGATES)
     shifted = [np.roll(e, int(k)) for k in shifts]

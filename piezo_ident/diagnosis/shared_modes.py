@@ -53,18 +53,18 @@ from piezo_ident.record.record import Record
 NAME = 'loop_hysteresis'
 #: what is left of the error
 LEFT = 'structure that the shared modes do not account for'
-#: laws, simplest first; those of `IN_FRONT` leave the modes where they are
+#: laws, simplest first; the laws `IN_FRONT` do not move the modes
 LAWS = ('linear', 'plays in front', 'plays', 'softening', 'softening and plays')
 IN_FRONT = LAWS[:2]
 #: a law is preferred to simpler ones if it takes this share of their error (taste)
 WORTH = 0.1
 #: standard deviation of a normal variable in medians of its size
 NORMAL = 1.4826
-#: laws grow on so many records of a group, those of the largest weight (taste: time)
+#: number of records of a group to which laws are fitted, the largest weights first (taste: time)
 FEW = 2
-#: largest correlation of two voltages: their paths are then known ten times worse than their sum
+#: largest correlation of two voltages: their difference then has a tenth of the size of their sum
 ONE_SIGNAL = 0.98
-#: orders that are tried (taste: the ratio of two is that of their errors' resolution)
+#: orders that are tried (taste)
 ORDERS = (4, 6, 8, 12, 16, 20, 28, 36, 44, 52)
 #: steps of each part of a fit, and of the last fit to all records (taste: the error falls no more)
 STEPS, LAST_STEPS = 10, 6
@@ -199,7 +199,7 @@ def _beats(error: float, chains: float) -> bool:
 
 
 def _noise(records: Sequence[PeriodicRecord]) -> float:
-    """Compute the noise in one period, in % of rms(y); the end of a settling does not count."""
+    """Compute the noise in one period, in % of rms(y), by medians, as the start may settle."""
     of_each = [NORMAL * np.median(np.abs(r.noise), axis=0) for r in records]
     power = [np.mean(r.y[-1] ** 2, axis=0) for r in records]
     shares = [np.sum(n**2) / np.sum(p) for n, p in zip(of_each, power, strict=True)]
@@ -207,7 +207,7 @@ def _noise(records: Sequence[PeriodicRecord]) -> float:
 
 
 def _steady(chains: MultiAxisModel, records: Sequence[PeriodicRecord], v0: Array) -> list[Array]:
-    """Simulate chains over a period, which is run through once before."""
+    """Simulate chains over the second of two equal periods."""
     answers, order = [], sorted(chains.axes)
     for record in records:
         v = np.tile(record.u[-1] + v0, (2, 1))

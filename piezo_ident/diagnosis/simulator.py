@@ -5,7 +5,7 @@
 Run the whole model over the rows, many times with small changes.
 
 Candidates, finite differences and the joint fit need the prediction for other weights or other
-effects.  The signals before the changed link are kept from the run before.
+effects.  The signals before the changed link are kept from the previous run.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Simulator:
         return [self, *self._copies[: count - 1]]
 
     def forget(self) -> None:
-        """Free the memory of the signals that were kept from the run before."""
+        """Free the memory of the signals that were kept from the previous run."""
         self._kept = None
         for answer in self._answers:
             answer.clear()

@@ -35,7 +35,7 @@ BEYOND = 4.0
 ROUNDING = 1e-4
 #: effect that continues after the motion has ended
 CREEP = 'creep'
-#: effect that resembles creep beside an H that is not a sum of plays
+#: effect that is a displacement which changes with time
 DRIFT = 'thermal_drift'
 #: effect that is a gain which changes with time
 WANDERS = 'gain_drift'
@@ -317,7 +317,7 @@ def cost_of_decays(rows: Rows) -> float:
 def with_known(
     state: State, parameters: Sequence[FreeParameter], prior: Array, pull: Pull | None
 ) -> Pull | None:
-    """Add to a pull the prior's pull of small numbers towards zero."""
+    """Add to a pull the prior that draws amplitudes with a spread to zero."""
     p = prior.size
     size = np.zeros(p)
     size[places_of_decays(state)] = state.earlier.ravel()

@@ -249,9 +249,9 @@ Place = tuple[Integers, Array]
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
-    Return whether the last added effect shows, at a plausible size, in the places of its own.
+    Tell whether the last added effect shows, with a plausible size, where it alone acts.
 
-    An effect without such places shows.  `noise` is the mean square of the noise of a row.
+    An effect outside of `_PLACES` always shows.  `noise` is the mean square of the noise of a row.
     """
     if fitted.name not in _PLACES:
         return True
