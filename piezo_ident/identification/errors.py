@@ -53,8 +53,8 @@ def fitted_memories(runs: Sequence[Run], model: StageModel) -> Memories:
     """
     Estimate the unknown memories at the starts of runs; runs that share a key have none.
 
-    The memories of the three steps belong to temporary plays.  With the plays of the model they
-    may be off by 3 % of stroke.
+    The memories of the three steps belong to temporary plays.  With the plays of the model these
+    memories may be off by 3 % of stroke.
     """
     keys = [key_of(run) for run in runs]
     starts = {
@@ -216,8 +216,8 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
             for kinds in (('triangle',), ('step', 'settle', 'noise'))
         )
         if sweeps.size and small.size:
-            beside = float(small.mean() - sweeps.mean())
-            if abs(beside) > ELSEWHERE * float(sweeps.std()):
+            shift = float(small.mean() - sweeps.mean())
+            if abs(shift) > ELSEWHERE * float(sweeps.std()):
                 return True
     return False
 

@@ -64,7 +64,7 @@ PLACES = 20
 #: edges of the bands [Hz] above `HIGH_PASS`, and the smallest rms of a band that counts,
 #: normalised
 EDGES, FAINT = (150.0, 750.0, 3000.0), 2e-4
-#: share of the range, and of the energy of every band, that must stay in the rest (taste)
+#: share of the range, and of the energy of every band, that the fitted samples must keep (taste)
 STAYS = 0.65
 
 
@@ -153,7 +153,7 @@ def _search(
 
 
 def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Choose a few windows: of the widest motion, of the fastest motion, and between them."""
+    """Choose three windows: of the widest motion, of the fastest, and of wide and fast motion."""
     size = WINDOWED // 3
     windows = []
     for s in stretches:
@@ -165,7 +165,7 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     speeds = [float(np.mean(np.diff(s.u[part]) ** 2)) for s, part in windows]
     order = [int(np.argmax(spans)), int(np.argmax(speeds))]
     order += sorted(range(len(windows)), key=lambda i: -spans[i] * speeds[i])
-    chosen = sorted(dict.fromkeys(order), key=order.index)[:3]
+    chosen = list(dict.fromkeys(order))[:3]
     short_stretches, count = [], 0
     for number, i in enumerate(sorted(chosen)):
         s, part = windows[i]

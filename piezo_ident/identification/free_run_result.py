@@ -95,7 +95,7 @@ def outcome_of(
 
 
 def _model(stage: Stage, rate: float, scaling: Scaling) -> StageModel:
-    # the zero of the sensor may have moved between records; the last one holds for new records
+    # the zero of the sensor may have moved between records; the last zero holds for new records
     seen = stage.creep > 0.0
     values = {'gain': stage.creep[seen].tolist(), 'time_constant': stage.taus[seen].tolist()}
     effects = (EffectSetting('creep', values),) if seen.any() else ()

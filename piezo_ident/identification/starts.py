@@ -32,11 +32,11 @@ Rule = Callable[[Array], Array]
 ROUGH, BLOCKS = 500, 2000
 #: number of plays of the temporary H, and of the blocks of a run in the fit (both taste)
 PLAYS, FIT_BLOCKS = 40, 50
-#: number of shares of the memory for each of the `PARTS` of a guess
+#: number of shares of the fitted memory for each share of a guess
 FINER = 2
-#: shares of the plays that were pushed down, and up, by the motion before the start
+#: shares m of plays that a rise before the start has pushed up, and that a fall has pushed down
 ENDS = (0.9, 0.1)
-#: iterations from every guess, from the best guesses, and number of the best
+#: iterations from every guess, from the best guesses, and number of best guesses
 FEW, MANY, BEST = 3, 15, 1
 #: share by which another guess must err less than the plain guess to be chosen: a record of steps
 #: alone tells little about the memory

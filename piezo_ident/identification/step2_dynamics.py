@@ -4,10 +4,10 @@
 """
 Step 2: find G from noise, for every order, free of hysteresis.
 
-Under small noise the slope of H is not constant: the noise drags its plays along, and a linear fit
-takes this for slow dynamics.  G is therefore found twice.  After a first G, a temporary H with
-fine thresholds is fitted to the triangle.  The output w = H[v] replaces the voltage of the noise
-segment, and G is found again from w to y.
+Under small noise the slope of H is not constant: the noise drags the plays along, and a linear fit
+takes their motion for slow dynamics.  G is therefore found twice.  After a first G, a temporary H
+with fine thresholds is fitted to the triangle.  Its output w = H[v] replaces the voltage of the
+noise segment, and G is found again from w to y.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ PAIR, BELOW_MODES, RINGS = 4.0 / 3.0, 1.0 / 3.0, 0.3
 #: orders within this share of the best held-out error count as equal; the smallest is tried first
 SLACK = 0.05
 #: share by which instrumental variables must err less than least squares to choose the orders
-BENT = 0.2
+INSTRUMENTS = 0.2
 #: share by which a larger order must lower the held-out error
 GAIN = 0.005
 #: samples that are simulated ahead of the first sample that counts
@@ -205,7 +205,7 @@ def _orders(
             for n in sizes
         }
         least = min(by_instruments.values(), default=np.inf)
-        if least < (1.0 - BENT) * table.held_out.min():
+        if least < (1.0 - INSTRUMENTS) * table.held_out.min():
             orders = [o for o, error in by_instruments.items() if error <= (1.0 + SLACK) * least]
     orders = orders[:candidates]
     if not orders:

@@ -116,7 +116,7 @@ def choose_thresholds(
         candidates = [(loss, even)]
         if 1 < places.size < even.size:
             candidates.append((_held_loss(fit, held, places, dynamics, delay)[0], places))
-        # the price of a threshold lets fewer of them win a tie
+        # the price of a threshold lets fewer thresholds win a tie
         loss, thresholds = min(
             candidates, key=lambda c: (c[0] * (1 + 1e-3 * c[1].size), c[1].size)
         )

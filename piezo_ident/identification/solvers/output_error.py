@@ -23,7 +23,7 @@ from piezo_ident.common.kernel import kernel
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
-#: poles beyond this radius count as unstable: they would ring for longer than any record
+#: poles beyond this radius, a decay of 100,000 samples, count as unstable
 RADIUS = 0.99999
 #: number of samples whose products are summed at once
 STRETCH = 1024
