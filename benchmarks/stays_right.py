@@ -61,36 +61,36 @@ TEXT = """\
 This page gives the errors of the live model on stages that change while they run
 (`make stays-right`).
 
-Each of {stages} simulated stages follows laws that the model does not have; nobody had looked at
-them while the live model was built. A stage was identified from one record and diagnosed on
-another. Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle with round
-corners. One thing about it changed {at:g} s later:
+Each of {stages} simulated stages follows laws that the model does not have. The live model
+was built without these stages. A stage was identified from one record and diagnosed on another.
+Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle with round corners.
+One thing about the stage changed {at:g} s later, or before the scan:
 
-- **creep amid motion**: it was at the highest voltage for ten seconds, until half a second before
-  the scan;
-- **temperature**: its zero drifts by 1 um, with a time constant of 5 s;
-- **gain step**: it moves 5 % more;
-- **gain ramp**: the same over 5 s;
-- **load**: twice the mass moves its first mode to 70 % of its frequency;
-- **loop width**: its loop is 10 % wider.
+- **creep amid motion**: the stage was at the highest voltage for ten seconds, until half a second
+  before the scan;
+- **temperature**: the zero drifts by 1 um, with a time constant of 5 s;
+- **gain step**: the stage moves 5 % more;
+- **gain ramp**: the gain grows by 5 % within 5 s;
+- **load**: twice the moving mass lowers the first mode to 70 % of its frequency;
+- **loop width**: the loop is 10 % wider.
 
 ![Errors of six ways after each of six changes](images/stays_right.png)
 
 *Dots: medians of the stages; lines: from the smallest to the largest.*
 
-Six ways tell where the stage is, from voltage up to now and displacement up to {horizon} samples
-before:
+Six ways estimate the displacement, from the voltage up to now and the displacement up to
+{horizon} samples before:
 
 - **ignore it**: the free run of the model, `prediction` on the graph;
 - **subtract the last second**: the free run, less the mean of its error over the last second;
-- **observer**: `estimate` as it is by default;
+- **observer**: `estimate` with its default settings;
 - **with its gain**: `estimate` with `observe_gain`;
 - **and its drift**: `estimate` with `observe_drift`;
 - **adaptation**: `estimate` with `adapt` = `hysteresis`.
 
-The error is the rms difference to the displacement free of noise, in % of the span of the stage,
-mean included. It is taken from {judged:g} to {rest:g} s after the change. The last two columns of
-the first table are ratios to the best of the last four ways.
+The error is the rms difference to the displacement without noise, in % of the span of the stage,
+from {judged:g} to {rest:g} s after the change. A constant difference counts. The last two
+columns of the first table are ratios to the best of the last four ways.
 
 {after}
 
@@ -110,8 +110,8 @@ ten errors of a normal law do.
 
 {claims}
 
-By default a gain, loop or mode that changed stays an error: then the node advises to identify
-again, to follow the gain, or to adapt. No way here follows a load. Amid strong creep of earlier
+By default a gain, loop or mode that changed stays an error: the node then advises to identify
+again, to follow the gain, or to adapt. No way follows a load. Amid strong creep of earlier
 motion the adaptation takes creep for gain, and errs more in its first seconds than the observer
 alone.
 """
