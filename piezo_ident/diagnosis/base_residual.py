@@ -76,7 +76,7 @@ class BaseResidual:
     Attributes
     ----------
     given : State
-        The model as given, with its own offset in each record.
+        The diagnosed model, with an offset in each record.
     plays, wide : Fitted
         H refitted as plays, and as the better of the wide laws.
     channels, lines, floor
@@ -86,7 +86,7 @@ class BaseResidual:
     missed : float
         Possible error of G on this motion, rms in % of stroke.
     faults : tuple of Fault
-        Faults of the data that the model as given shows.
+        Faults of the data in the residual of the diagnosed model.
     """
 
     given: State
@@ -102,7 +102,7 @@ class BaseResidual:
 
     @property
     def significant(self) -> list[str]:
-        """Effects that tests of their own have shown."""
+        """Effects whose own tests are significant."""
         # motion of another axis makes lines, too: the lines left beside its model are hum
         is_coupled = any(test.significant for test in self.channels)
         tests = {'cross_coupling': is_coupled, HUM: bool(self.lines.lines)}

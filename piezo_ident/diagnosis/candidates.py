@@ -64,9 +64,9 @@ class CandidateSearch:
 
     def shown(self, names: Sequence[str]) -> tuple[Fitted, tuple[str, ...]]:
         """
-        Add effects that tests of their own have shown; return the fit and the added names.
+        Add effects whose own tests are significant; return the fit and the added names.
 
-        Each must lower the mean square by at least `SMALLEST_EFFECT`, beside the effects before.
+        Each must lower the mean square by at least `SMALLEST_EFFECT`, beside the earlier effects.
         """
         fitted = self._residual.wide
         least = self._simulator.rows.square(SMALLEST_EFFECT)

@@ -8,7 +8,7 @@ Physics: the constant follows from the behaviour of stages, of sensors and of th
 Statistics: the constant follows from a test, or from the accuracy of an estimate.
 Taste: another choice would be defensible.
 
-Shares and ratios compare mean squares beyond the noise.  Sizes are rms in % of stroke.
+Shares and ratios compare mean squares less the noise.  Sizes are rms in % of stroke.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 #: smallest size of an effect that is named: real laws differ from textbook laws by about as much
 SMALLEST_EFFECT = 0.05
 #: a change of G must exceed the error of G at its identification.  The error grows by this share
-#: of the growth of the fast motion: the rest of it was small loops, not G
+#: of the growth of the fast motion: the rest of the error was small loops, not G
 IN_PROPORTION = 0.5
 #: the zero of the sensor has moved if the mean error of a record is so many times its other error
 MOVED_ZERO = 3.0

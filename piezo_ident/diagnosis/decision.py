@@ -19,7 +19,7 @@ samples any law of the right trend gains a significant part.
 
 A wide H can imitate an effect that follows the path of the voltage, so such an effect gains little
 beside a refitted H.  If the effect has set in since the identification, the H as given lacks it.
-The effect is then the finding if it does most of the work of a refit beside the given H.
+The effect is then the finding if it gains most of what a refit gains, beside the H as given.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class FittedSet:
     """
     A set of effects beside one treatment of H and G, fitted.
 
-    The effects are sorted, without the effects that tests of their own have shown.  The way is the
+    The effects are sorted, without the effects that have tests of their own.  The way is the
     treatment of H: 'given', 'plays' or 'wide'.  `found_in` is the search that found the candidate.
     """
 
@@ -98,11 +98,11 @@ class Candidates:
         return NOISE_SHARE * self.noise
 
     def left(self, candidate: FittedSet) -> float:
-        """Compute the error of a candidate beyond the noise, a mean square."""
+        """Compute the mean square error of a candidate less the noise."""
         return self.left_by(candidate.fitted)
 
     def left_by(self, fitted: Fitted) -> float:
-        """Compute the error of a fit beyond the noise, a mean square."""
+        """Compute the mean square error of a fit less the noise."""
         error = np.sqrt(fitted.errors.sum() * fitted.transfer.sum()) / self.rows.n
         return self.beyond_noise(float(error))
 

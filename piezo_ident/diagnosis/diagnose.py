@@ -184,7 +184,7 @@ def _result(
 ) -> Diagnosis:
     """Report the findings, without a sentence."""
     model, rows = simulator.model, simulator.rows
-    # an effect that its own test has shown is beside all candidates
+    # all candidates contain the effects whose own tests are significant
     best = candidates.without().fitted
     without = residual.wide if best.state.effects else best
     before, refit, held_out, after = _errors(simulator, residual, without, last.fitted)

@@ -360,7 +360,7 @@ POLISHING, POLISH = 6, 0.02
 
 
 def least_gain(rows: Rows, noise: float) -> float:
-    """Return the smallest useful gain of a step for a given noise; both are mean squares."""
+    """Return the smallest useful gain of a step; gain and noise are mean squares."""
     return OF_LEAST * min(noise, rows.square(SMALLEST_EFFECT))
 
 

@@ -118,7 +118,7 @@ def walk(
 
 
 def _left(candidates: Candidates, fitted: Fitted) -> float:
-    """Compute the error of a fit on whole kinds of motion beyond the noise, a mean square."""
+    """Compute the mean square error of a fit on whole kinds of motion less the noise."""
     return candidates.beyond_noise(float(fitted.transfer.sum()) / candidates.rows.n)
 
 
@@ -140,7 +140,7 @@ def _steps(
         state = first.state.with_effects_of(best.fitted.state)
         beside = known.get('given') or tried(fit_jointly, simulator, state)
         if beside is None:
-            # beside the given H the effect runs away, so the H of the candidate stays
+            # the fit diverges beside the given H, so the H of the candidate stays
             yield WalkStep(best.way, best.fitted)
             return
         first = beside
@@ -188,7 +188,7 @@ def with_numerator(simulator: Simulator, step: WalkStep) -> WalkStep:
 
     An identification without the effect has distorted G.  The effect itself moves its mode, so
     this pole stays.  Other poles may have imitated the effect, so G is tried without them, too.
-    The result is the given step if its error falls by less than a `POLISH`, or if the fit fails.
+    The result is `step` itself if the error falls by less than `POLISH`, or if the fit fails.
     """
     model, best = simulator.model, step
     for added in step.fitted.state.effects:
@@ -294,8 +294,8 @@ def toward_given(
 
     h and h_0 are the new and the given H under loops over the range of the model, and n is the
     number of rows.  Offsets compensate the mean difference c.  The given H keeps terms small that
-    compensate for one another on these rows, but not elsewhere.  It does not count if the data
-    cover only a part of the range: the refined model then holds in this part only.
+    compensate for one another on these rows, but not elsewhere.  If the data cover only a part of
+    the range, the given H does not count, and the refined model holds in this part only.
     """
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     if law is None or rows.kinds or not rows.covers(scaling.range):

@@ -7,7 +7,7 @@ Find hysteresis inside the loop of modes that several axes share.
 Each law is one model for all amplitudes.  It is fitted in free run to multisines, and judged on
 one multisine of each amplitude that is held out:
 
-- ``linear``: nothing else;
+- ``linear``: no hysteresis;
 - ``plays in front``: plays of the voltages, in front of the mechanics;
 - ``plays``: plays of the actuators' extension inside the loop;
 - ``softening``: stiffness that follows the level of the extension;
@@ -134,7 +134,7 @@ def find_shared_modes(
     tests: bool = False,
 ) -> SharedModesFinding | None:
     """
-    Find hysteresis inside the loop of shared modes, if chains err more without it.
+    Find hysteresis inside the loop of shared modes, if the chains of the axes err more.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class Simulator:
 
     @property
     def _band(self) -> float:
-        """Frequency beyond which the retuning of G does not grow [Hz]."""
+        """Frequency above which the retuning of G does not grow [Hz]."""
         return BEYOND * self.rows.highest_frequency
 
     @functools.cached_property

@@ -72,7 +72,7 @@ class Findings:
     set_in: bool = False
 
     def unexplained(self, description: str) -> Unexplained:
-        """Describe the error left beyond the noise."""
+        """Describe the error that is left, less the noise."""
         share = 1.0 - self.share if self.effects or self.left else 0.0
         return Unexplained(share, self.left, description)
 
@@ -88,8 +88,8 @@ def judge(
     """
     Judge a decision, with the last step of the walk of H.
 
-    Tests of their own have shown the effects `shown`; without them the mean square error of the
-    best H is `before`.  The effects `untried` were not among the candidates.
+    The effects `shown` have significant tests of their own; without them the mean square error of
+    the best H is `before`.  The effects `untried` were not among the candidates.
     """
     rows, best = candidates.rows, decision.best
     rest, whole = candidates.left_by(last.fitted), decision.whole
@@ -259,7 +259,7 @@ def untestable_of(
 
 
 def errors_of_sets(candidates: Candidates) -> Mapping[tuple[str, ...], float]:
-    """Compute the error beyond the noise that each set of effects leaves, % of stroke."""
+    """Compute the error less the noise that each set of effects leaves, % of stroke."""
     bests = ((s, candidates.best(s)) for s in candidates.sets)
     return {s: candidates.rows.percent(candidates.left(c)) for s, c in bests if c is not None}
 

@@ -30,9 +30,9 @@ class AmplifierLag(Effect):
     First-order lag of the amplifier, in front of H.
 
     ``va(k) = a va(k-1) + (1 - a) v(k)`` with ``a = exp(-1 / (f_s tau))``.  The time constant
-    tau = R C is the output resistance of the amplifier times the capacitance of the piezo.  G is
-    identified with the lag in place and contains most of it.  The rest is that the loops of H
-    follow the lagged voltage.
+    tau = R C is the output resistance of the amplifier times the capacitance of the piezo.  An
+    identification puts most of the lag into G.  The loops of H still follow the lagged voltage,
+    not the command.
 
     Notes
     -----

@@ -60,7 +60,7 @@ class Parameter:
         free H, because H can do the same.
     spread : float
         For an amplitude: prior rms of its numbers, which counts as one more observation in a
-        fit.  It keeps numbers small that compensate each other.
+        fit.  The prior keeps numbers small that compensate each other.
     """
 
     name: str
@@ -286,7 +286,7 @@ class Effect:
         List the settings at which the effect is tried on some data.
 
         By default, all combinations of the `tries` of parameters that are not amplitudes, with
-        all amplitudes moved.  Such a parameter needs `tries` or a default, or no trial is left.
+        all amplitudes moved.  Each of these parameters needs `tries` or a default.
         """
         shapes = [p for p in cls.parameters if not p.is_amplitude]
         choices = [p.tries or (() if p.default is None else (p.default,)) for p in shapes]

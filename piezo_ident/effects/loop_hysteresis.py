@@ -24,7 +24,7 @@ from scipy.linalg import expm
 REPEATED = 3
 #: phase of a mode in a sub-step [rad] (physics: a twentieth of a radian integrates a loop to 1e-3)
 PHASE = 0.05
-#: steps of Newton's method to the bend of a spring at rest (it doubles the digits)
+#: steps of Newton's method to the deflection at rest (each doubles the digits)
 BENDS = 8
 #: a mode with less damping resonates (physics: above 1/sqrt(2) its response has no peak)
 RESONATES = math.sqrt(0.5)
@@ -146,7 +146,7 @@ class LoopHysteresis(Effect):
 
     and e_i is the output of a play of half width r_i that q drives.  The signal behind the effect
     is x - h, and G remains the linear part.  An element with r = 0 is the law of Bouc and Wen, and
-    a lag along the path (Dahl) if skew = 0, too.  With gamma = 0 it is a play.
+    a lag along the path (Dahl) if skew = 0, too.  With gamma = 0 the element is a play.
     `elastic` and `viscous` return to G what G had absorbed of the mean stiffness and damping.
 
     Notes
@@ -159,8 +159,8 @@ class LoopHysteresis(Effect):
 
     name = 'loop_hysteresis'
     slot = 'hidden'
-    # elastic and viscous alone are a linear change of the mode; far below it, square and cubic
-    # bend the displacement
+    # elastic and viscous alone are a linear change of the mode; far below the mode, square and
+    # cubic bend the displacement
     contains = (
         'amplifier_lag',
         'changed_dynamics',

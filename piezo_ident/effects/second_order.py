@@ -50,8 +50,8 @@ class SecondOrderSection:
     """
     ``g (M(s) - 1) + k R(s)`` with M = w^2/D, R = w s/D and D = s^2 + 2 zeta w s + w^2.
 
-    With S = s/w the sum is ``(-g (S^2 + 2 zeta S) + k S) / (S^2 + 2 zeta S + 1)``.  It has a zero
-    at frequency 0, which the filter takes as a difference of the input.
+    With S = s/w the sum is ``(-g (S^2 + 2 zeta S) + k S) / (S^2 + 2 zeta S + 1)``.  Its zero at
+    frequency 0 is the difference of the input that the filter processes.
 
     Parameters
     ----------

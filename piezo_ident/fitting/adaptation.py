@@ -53,7 +53,7 @@ Recalled: TypeAlias = Callable[[StageModel], Stream] | None
 
 #: time over which samples are averaged to one measurement [s]
 GROUP = 2e-3
-#: time constant of the high-pass [s]: below it lie scans, above it drift and slow creep (taste)
+#: time constant of the high-pass [s]: scans are faster, drift and slow creep are slower (taste)
 SLOW = 0.1
 #: time of motion after which a measurement counts by 1 / e [s].  A change shall be learnt within
 #: 10 s, more than five of these times
@@ -267,7 +267,7 @@ class Adaptation:
         v, t : ndarray, shape (n,)
             Voltage [V] and its time [s].
         free : ndarray, shape (n,)
-            Free run of the given model [m].
+            Free run of the model without changes [m].
         measured : ndarray, shape (n,)
             Displacement `horizon` samples before each sample [m]; NaN if it is missing.
         sound : bool, optional

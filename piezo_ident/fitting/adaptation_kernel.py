@@ -107,11 +107,11 @@ def _take(
         # another stage: return to the prior
         information[:, :] = prior
         now[REFUSED] = 0.0
-        # or the model lacks an effect of the stage, which then counts as error
+        # the model may also lack an effect of the stage, which then counts as error
         now[SCALE] *= 2.0
     else:
         now[REFUSED] = max(0.0, now[REFUSED] - RARE)
-        # the scale grows slowly, or a step would count as such an error
+        # the scale grows slowly, so that a step of the sensor hardly raises it
         now[SCALE] = max(1.0, now[SCALE] * (1.0 + RARE**2 * (score - 1.0) / patience))
     now[LEARNT] += 1.0
     power = now[SCALE] * law[ERROR]

@@ -177,7 +177,7 @@ def fast_error(model: StageModel, law: str, runs: Sequence[Run]) -> tuple[float,
 
 def validation_errors(model: StageModel, records: Sequence[Record]) -> list[ErrorRow]:
     """
-    Compute the free-run errors of records that were given for validation.
+    Compute the free-run errors of validation records.
 
     Readings that `without_faults` removed do not count.  Raises IdentificationError if a record
     has no piece at the sampling rate of the model.

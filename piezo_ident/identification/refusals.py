@@ -112,7 +112,7 @@ def _left_of_parts(A: Array, y: Array) -> float:
 
 
 def refuse_delay(pieces: Sequence[Piece], delay: int | None) -> None:
-    """Refuse a given delay [samples] that leaves less than half of the longest piece."""
+    """Refuse a delay [samples] that leaves less than half of the longest piece."""
     longest = max(piece.n for piece in pieces)
     if delay is not None and 2 * delay > longest:
         raise IdentificationError(

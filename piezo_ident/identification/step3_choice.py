@@ -298,9 +298,9 @@ def third_step(
     """
     Find H: choose law and thresholds by held-out error, then fit the weights.
 
-    A given number of thresholds is kept.  `fit` and `held` are the same runs in the same order
-    with the fitted and the held-out samples.  The final weights are fitted to `whole`, `fit` by
-    default.  `others` is small motion, which can reject a wider law.
+    A number of thresholds in the settings stays.  `fit` and `held` are the same runs in the same
+    order with the fitted and the held-out samples.  The final weights are fitted to `whole`, by
+    default `fit`.  `others` is small motion, which can reject a wider law.
     """
     progress('hysteresis', 0.0)
     fitted = whole or fit

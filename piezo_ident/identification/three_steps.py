@@ -4,7 +4,7 @@
 """
 The three steps on labelled records: delay from steps, G from noise, H from a triangle.
 
-H is fitted last, with the chosen or given thresholds.  The models that the steps lead to are
+H is fitted last, with thresholds that were chosen or set.  The models that the steps lead to are
 compared by their free run on samples that no step fits.
 """
 
@@ -68,7 +68,7 @@ def fit_three_steps(
     progress: Progress,
     steps: Steps,
 ) -> FitOutcome:
-    """Take the steps that are not given, and choose between the models that they lead to."""
+    """Take the missing steps, and choose between the models that they lead to."""
     started, steps = with_starts(runs), steps.beside(settings.delay)
     delay_result = steps.delay or first_step(started, settings, progress)
     delay = Delay(delay_result.samples)

@@ -317,7 +317,7 @@ class Hysteresis:
         Compute the lags along the path of a stage that was swept, came down, and went to `v0`.
 
         The sweeps cover the span.  The result, shape (k + 1,), holds the lags and then `v0`, as
-        `follow` expects them.  It fits `initial_memory`, whose plays last came down, too.
+        `follow` expects them.  The plays of `initial_memory` last came down, too.
         """
         if self.relaxations is None:
             return np.array([v0])

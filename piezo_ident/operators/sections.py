@@ -19,8 +19,8 @@ from piezo_ident.common.kernel import alive, ordered_kernel
 
 #: share of the output that eq. (5) may lose by rounding
 LOST = 2e-14
-#: largest relative error of the sections: of their static gain, and of their products against B
-#: and A; beyond it the roots are too inaccurate
+#: largest relative error of the static gain of the sections, and of their products against B and
+#: A: a larger error means inaccurate roots
 NEAR, SAME = 1e-2, 1e-12
 #: share of the largest b up to which the first b counts as zero: its roots would overflow
 NOTHING = 1e-300

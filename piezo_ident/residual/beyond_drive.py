@@ -41,7 +41,7 @@ AROUND = 0.05
 @dataclass(frozen=True)
 class ChannelTest:
     """
-    Whether a further channel explains a residual beyond the drive.
+    Whether a further channel explains residual that the drive does not explain.
 
     An unrelated channel is `significant` in one of 100,000 cases; `added` is its contribution to
     the residual of each part [m], empty without a test.
@@ -128,7 +128,7 @@ class _Part:
 
 def channel_tests(parts: Sequence[ResidualPart]) -> tuple[ChannelTest, ...]:
     """
-    Test every further channel of records for a share in the residual beyond the drive.
+    Test whether each further channel explains residual that the drive does not explain.
 
     Functions of the drive (`drive_functions`) are subtracted from residual and channel.  Both are
     divided by the level of the residual nearby, so that quiet stretches count, and made white.

@@ -104,7 +104,7 @@ def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> L
             found.append(Line(frequency, amplitude, (), tuple(sines)))
             search = search.without(found[-1])
             score, gain = search.score()
-            # lines like the last one and close to it, the last one among them
+            # the last line, and lines of similar size and frequency
             crowd = [
                 line
                 for line in found

@@ -234,7 +234,7 @@ _Lags = tuple[Array, int, float, int]
 
 
 def _inner(one: _Lags, other: _Lags, n: int) -> Array:
-    """Sum the products of two groups of lags, each given as (signal, first row, sign, lags)."""
+    """Sum the products of two groups of lags, each (signal, first row, sign, number of lags)."""
     (x, x_at, x_sign, n_x), (z, z_at, z_sign, n_z) = one, other
     return x_sign * z_sign * lag_products(x, z, x_at, z_at, n, n_x, n_z)
 

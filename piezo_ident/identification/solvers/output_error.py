@@ -198,7 +198,7 @@ def output_error(
     tick: Callable[[], None] = lambda: None,
 ) -> OutputErrorFit:
     """
-    Refine stable dynamics of given orders by free-run simulation error.
+    Refine stable dynamics by free-run simulation error; the orders stay.
 
     The result is stable, and the start itself if no step lowers the error.  `tick` is called once
     an iteration; it may raise to stop the work.
