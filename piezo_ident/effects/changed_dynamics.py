@@ -21,8 +21,8 @@ class ChangedDynamics(Effect):
     ``D = s^2 + 2 zeta w s + w^2``, each by the bilinear transform, prewarped at its own frequency.
 
     A resonance that moved from (w, zeta) to (w', zeta') has exactly this form, with the new
-    frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``: the
-    old mode times the effect is the new mode.  An added mode with a share g has k = 0.  g
+    frequency and damping, ``g = 1 - (w'/w)^2`` and ``k = 2 zeta w'/w - 2 zeta' (w'/w)^2``.  The
+    old mode times the effect is then the new mode.  An added mode with a share g has k = 0.  g
     therefore stays below 1, and above -3 if a mode moved by at most a factor of two.  A mode far
     above the band with a larger g would imitate any lag.
 

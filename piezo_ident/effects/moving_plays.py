@@ -120,8 +120,8 @@ def growth_slopes(
     derivatives by the three parameters that shape the power; `bends`, shape (3, n), holds the
     derivatives of the power by these parameters.
     """
-    # the three sums are written out, so that the loops over plays vectorise; a play that moves has
-    # the derivative of the edge that moves it, and a play that rests keeps its last derivative
+    # the three sums are written out, so that the loops over plays vectorise.  A moving play has
+    # the derivative of the edge that moves it.  A resting play keeps its last derivative
     n_r, (gain, stretch, lead, lead_stretch) = r.size, growth
     by_low, by_high, weight = np.zeros(n_r), np.zeros(n_r), np.empty(n_r)
     one, two, three = np.zeros(n_r), np.zeros(n_r), np.zeros(n_r)

@@ -17,8 +17,8 @@ for the theta_j that a group informs about, and never below the information of t
 
     L <- A L A + (1 - A^2) L0 + f f' / R,      A_j^2 = 1 - (1 - mu) s_j / (s_j + e R)
 
-L is the information, L0 the diagonal information of the prior, R the variance of a measurement,
-s_j = f_j^2 / L0_jj, mu follows from `MEMORY`, and e is `TELLS` of the kernel.  A stage at rest
+L is the information, L0 the diagonal information of the prior, R the variance of a measurement.
+s_j is f_j^2 / L0_jj, mu follows from `MEMORY`, and e is `TELLS` of the kernel.  A stage at rest
 informs about no theta_j, so theta stays.  Half-spaces bound theta: the weights of plays stay
 positive, H rises, and each change has a plausible size.  A theta outside of a half-space moves
 onto it along L^-1.  Measurements far from the prediction are refused for `PATIENCE`, in which the

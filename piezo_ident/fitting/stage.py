@@ -14,8 +14,8 @@ creep at its first sample.  Each record adds the memory at its start,
     F_r(0) = v(0) - int_0^r m(r') dr',      0 <= m <= 1,
 
 with m constant on `PARTS` even parts of the thresholds.  A record that begins at rest, at zero,
-begins with m = 0 and l = 0, as a simulation does.  Free values would absorb errors of H.  Without
-`rested` its l is free, because a voltage at rest does not exclude creep of earlier motion.
+begins with m = 0 and l = 0, as a simulation does.  Free values would absorb errors of H.  If
+`rested` is false, its l is free: a voltage at rest does not exclude creep of earlier motion.
 
 With w_f = z^-d w/A and y_f = y/A the derivatives by b_j and a_i are shifts of two filtered
 signals, w_f(k-j+1) and -y_f(k-i): Ljung, System Identification, 2nd ed. (1999), section 10.3.
@@ -24,9 +24,9 @@ H rises with the voltage.  Right behind a turning point only its powers of v mov
 a quadratic in v.  The fit uses its coefficients in the basis of Bernstein, (1-t)^2, 2t(1-t) and
 t^2, where t runs from 0 to 1 over the span of the law.  Each is at least `LEAST_SLOPE`.  With lags
 along the path the slope depends on the whole past.  The slope is still linear in c, and is held
-above `LEAST_SLOPE` on sweeps between any two of a few voltages.  A slope that the gain of G has
-already made smaller, as it moved into H, may stay: a step that had to raise the slope could
-increase the loss, and the fit would end at its start.
+above `LEAST_SLOPE` on sweeps between any two of a few voltages.  The gain of G may lower a slope
+further when this gain moves into H.  The lowered slope then stays.  A step that had to raise the
+slope could increase the loss, and the fit would end at its start.
 """
 
 from __future__ import annotations

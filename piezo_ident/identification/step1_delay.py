@@ -137,7 +137,7 @@ def find_jumps(v: Array, before: int, after: int) -> Integers:
     large = large[(large >= before) & (large + after <= v.size)]
     if large.size == 0 or before < 2:
         return np.asarray(large, dtype=np.int64)
-    # ahead[k] is the largest difference between the samples k - before .. k - 1
+    # ahead[k - before] is the largest difference between the samples k - before .. k - 1
     ahead = np.lib.stride_tricks.sliding_window_view(dv, before - 1).max(axis=1)
     quiet = ahead[large - before] < 0.05 * dv[large - 1]
     return np.asarray(large[quiet], dtype=np.int64)

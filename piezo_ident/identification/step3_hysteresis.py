@@ -39,7 +39,7 @@ from scipy.optimize import OptimizeResult
 
 #: box in which the swarm starts and stays, in units of full stroke over full voltage range
 WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
-#: a play that moves by less than this share of its size cannot be told from the offset
+#: share of the column of v^3, or of a column itself, below which a rest of a column is rounding
 STILL = 1e-8
 #: weight that pulls lags along the path to zero, as a share of the size of the linear term
 PULL = 0.01

@@ -27,8 +27,8 @@ from scipy.special import gammaincc, gammaln
 LINES = 6
 #: chance of one false line in a search
 SIGNIFICANT = 1e-3
-#: least amplitude of a line as a share of the stroke, as converters make smaller lines, and of the
-#: residual, as motion that is nearly locked to the drive makes smaller lines
+#: least amplitude of a line as a share of the stroke, and of the rms residual.  Converters make
+#: smaller lines, and so does motion that is nearly locked to the drive
 SMALLEST, SIDELINE = 1e-5, 0.01
 #: points of the common grid in one bin of the whole time of a search
 FINE = 2.5

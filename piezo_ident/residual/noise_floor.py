@@ -25,8 +25,8 @@ SETTLING, SETTLING_TIME = 0.2, 0.02
 WHITE, FEWEST = 0.95, 2000
 #: longest block of a table of block lengths [samples]
 LONGEST_BLOCK = 4096
-#: least power of a line over its surroundings, which white noise exceeds once in e^10 bins; and
-#: number of places in an octave at which the surroundings are measured, over two octaves (taste)
+#: least power of a line over its surroundings: white noise exceeds this ratio once in e^10 bins.
+#: Places in an octave at which the surroundings are measured, over two octaves (taste)
 LINE, AN_OCTAVE = 10.0, 4
 
 

@@ -202,7 +202,7 @@ def find_repeats(v: Array, halvings: int = 3) -> list[tuple[int, int, int]]:
     Find the repeats of a signal in order: (start, stop, period) [samples].
 
     A candidate is a minimum of the mean square difference between the signal and the shifted
-    signal, behind the first maximum of that difference: de Cheveigne and Kawahara (2002), J.
+    signal, behind the first maximum of this difference: de Cheveigne and Kawahara (2002), J.
     Acoust. Soc. Am. 111, 1917-1930, doi:10.1121/1.1458024.  Each candidate is then compared sample
     by sample, so that motion before and after does not hide it.  A repeat has three periods or
     more.  Motions of several periods hide each other: without a repeat, both halves are searched.
@@ -259,8 +259,8 @@ def _candidates(v: Array) -> list[int]:
     behind = int(np.argmax(d > 0.2 * top))
     minima = np.flatnonzero((d[1:-1] <= d[:-2]) & (d[1:-1] < d[2:])) + 1
     minima = minima[(minima > behind) & (d[minima] < 0.8 * top)]
-    # a short period that is no whole number of samples repeats exactly at a multiple, and a signal
-    # may have a short and a long period in turn: the best of every octave are tried
+    # a period between two numbers of samples repeats exactly at its multiples only.  A signal may
+    # also have two periods in turn.  The best minima of every octave are therefore tried
     octave = np.floor(np.log2(np.maximum(minima, 1)))
     chosen: set[int] = set()
     for k in np.unique(octave):
