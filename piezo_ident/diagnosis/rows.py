@@ -128,11 +128,6 @@ class Rows:
         low, high = self.driven
         return high - low >= COVERED * (span[1] - span[0])
 
-    def leaves(self, span: Sequence[float]) -> bool:
-        """Return whether the voltage leaves a span [V] so far that H is unknown there."""
-        (low, high), (least, most) = self.driven, span
-        return most - least < COVERED * (max(high, most) - min(low, least))
-
     @property
     def passes(self) -> float:
         """Number of passes of the command over its range, in either direction."""
