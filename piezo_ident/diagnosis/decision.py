@@ -253,8 +253,7 @@ def decide(candidates: Candidates) -> Decision:
 def _set_in(candidates: Candidates) -> Decision:
     """Decide whether an effect has set in, if no set is admissible beside the best H."""
     found = candidates.like_refit()
-    # only labels tell the earlier error on other motion; the H of any material has some loops that
-    # were never congruent
+    # only labels tell the earlier error on other motion
     if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
         return Decision(None, candidates.left(candidates.without()))
     best = _simplest(candidates, found)

@@ -86,8 +86,7 @@ def held_out_kinds(
         if found is not None:
             return found
     if len(names) == 1 or few:
-        # one kind, or few judged parts, would leave no data to predict from: parts of the judged
-        # data replace the kinds
+        # one kind, or few judged parts, would leave no data to predict from
         whole = ' and '.join(dict.fromkeys(name.partition(PART)[0] for name in names))
         group = np.arange(group.size) * GROUPS // group.size
         names = [f'{whole}{PART}{i + 1}' for i in range(int(group.max()) + 1)]

@@ -172,8 +172,7 @@ def _explained(result: Diagnosis) -> str:
     """Say which effects explain which share of the error."""
     missed = 'what the model missed'
     if not result.set_in and result.refit.overall < 0.5 * result.before.overall:
-        # shares are then relative to the error of a refit: a sensor that was zeroed again is no
-        # effect
+        # shares then refer to the error of a refit: a sensor that was zeroed again is no effect
         missed = 'what a refit of the hysteresis leaves'
     names = ' and '.join(effect.name.replace('_', ' ') for effect in result.effects)
     explains = 'explains' if len(result.effects) == 1 else 'explain'

@@ -83,8 +83,7 @@ def _at_given_gain(simulator: Simulator, given: State, state: State) -> State:
     if not any(added.name == WANDERS for added in kept):
         return state
     others, state = tuple(added for added in kept if added.name != WANDERS), state.from_rest()
-    # the next record need not have the mean gain of these records; H was identified at the given
-    # gain
+    # the next record need not have the mean gain of these records, so the identified gain stays
     runs = (simulator.run(s) for s in (replace(state, effects=others), given))
     x, known = (centred(run, simulator.rows.of_record) for run in runs)
     gain = float(x @ known / (x @ x)) - 1.0
@@ -160,8 +159,7 @@ def _model(
     scaling = model.scaling
     offset = float(state.offsets[k])
     if any(added.name in (DRIFT, WANDERS) for added in state.effects):
-        # a slow drift and an offset compensate for one another, and the next record may drift
-        # differently: the zero keeps its place
+        # drift and offset compensate each other, and the next record drifts otherwise
         given = State(simulator.model.hysteresis, np.zeros(len(rows.names)))
         rest = simulator.run(given) - simulator.run(replace(state, effects=kept))
         offset += float(rest[rows.of_record == k].mean())
@@ -169,7 +167,6 @@ def _model(
     told: dict[str, Any] = {'unit': '% of stroke', 'formula': FORMULA}
     told |= zip(('before', 'after'), (float(e.overall) for e in errors), strict=False)
     if errors:
-        # error on the worst kind of motion
         told['worst'] = float(max(errors[-1].by_segment.values()))
     own = {
         'verdict': findings.verdict,

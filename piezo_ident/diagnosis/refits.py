@@ -306,8 +306,7 @@ def toward_given(
     h = given.hysteresis(u)
     h = h - h.mean()
     P, h = (x / np.sqrt(u.size) for x in (P, h))
-    # equal weight of rows and given H: a smaller weight fitted these rows better and other motion
-    # worse
+    # with a smaller weight of the given H, these rows were fitted better and other motion worse
     weight = float(rows.n)
     A = weight * (P.T @ P)
 

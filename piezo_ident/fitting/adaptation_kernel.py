@@ -88,7 +88,7 @@ def _take(
     information: Array,
     now: Array,
 ) -> None:
-    # takes one measurement e = f theta
+    # learns from one measurement e = f theta
     n, power, patience = f.size, now[SCALE] * law[ERROR], law[PATIENCE]
     told, off = 0.0, e
     for i in range(n):

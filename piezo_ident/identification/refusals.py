@@ -89,7 +89,6 @@ def held_out_errors(piece: Piece) -> tuple[float, float]:
     one = np.ones((t.size, 1))
     line = np.column_stack([one, t])
     drifts = [np.log(np.arange(1.0, t.size + 1.0)), *np.exp(-0.5 * np.outer(DECAYS, t + 1.0))]
-    # 3 powers, and plays of widths up to nearly the whole range
     powers = u[:, None] ** np.arange(1, 4)
     r = np.arange(1, PLAYS + 1) / (PLAYS + 1.0)
     plays = play_columns(u, r, u[0] - 0.5 * r).T

@@ -136,8 +136,7 @@ def _outliers(part: ResidualPart, noise: _Noise, known: Mask, jitter: float = 0.
     height = np.zeros(e.size)
     height[1:-1] = e[1:-1] - 0.5 * (e[:-2] + e[2:])
     size = np.abs(height)
-    # the usual scatter around a sample changes along jittered or driven data: the largest median
-    # of a block and its neighbours
+    # the scatter changes along jittered or driven data: take the largest median of three blocks
     blocks = max(1, size.size // WINDOW)
     medians = np.median(size[: blocks * WINDOW].reshape(blocks, -1), axis=1)
     medians = maximum_filter1d(medians, 3, mode='nearest')

@@ -164,8 +164,7 @@ class _Search:
                 doubt += own * own / s.worth
             safe = np.maximum(information, tiny)
             ratio = np.abs(top) ** 2 / safe
-            # F with 2 and 2k degrees of freedom, since the noise of each stretch is an estimate
-            # (Welch and Satterthwaite)
+            # F with 2 and 2k degrees of freedom, as each noise is an estimate (Satterthwaite)
             k = np.maximum(safe**2 / np.maximum(doubt, tiny), 1.0)
             gain += ratio
             total += k * np.log1p(ratio / k)
