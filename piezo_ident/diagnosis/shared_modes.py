@@ -14,9 +14,9 @@ one multisine of each amplitude that is held out:
 - ``softening and plays``: softening, and plays of extension and voltage inside the loop.
 
 Hysteresis inside the loop moves the modes with the amplitude.  Hysteresis in front of the
-mechanics changes the gain alone.  `loop_hysteresis` is therefore named only if linear models of
-each amplitude err clearly less with modes of their own than with those of all.  Without this
-test, a law with more signals may fit a hysteresis of the voltages better than plays in front do.
+mechanics changes gain and phase, not the modes.  `loop_hysteresis` is therefore named only if
+linear models of each amplitude err clearly less with their own modes than with common modes.
+Otherwise a law with more signals may fit hysteresis of the voltages better than plays in front.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from piezo_ident.record.channels import Axes
 from piezo_ident.record.record import Record
 
 NAME = 'loop_hysteresis'
-#: what is left of the error
+#: description of the remaining error
 LEFT = 'structure that the shared modes do not account for'
 #: laws, simplest first; the laws `IN_FRONT` do not move the modes
 LAWS = ('linear', 'plays in front', 'plays', 'softening', 'softening and plays')

@@ -57,7 +57,7 @@ class Parameter:
         For a parameter that is not an amplitude: values (or lists) worth trying on any data.
     first_stays : bool
         For a list over time: whether its first number stays fixed in a fit of one record with a
-        free H, because H can do the same.
+        free H, because H can take the place of this number.
     spread : float
         For an amplitude: prior rms of its numbers, which counts as one more observation in a
         fit.  The prior keeps numbers small that compensate each other.

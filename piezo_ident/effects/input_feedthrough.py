@@ -21,8 +21,8 @@ class InputFeedthrough(Effect):
 
     Notes
     -----
-    Capacitive coupling C into an input of resistance R reads R C dv/dt, common ground a share of
-    v: H. W. Ott, "Electromagnetic Compatibility Engineering", Wiley, 2009, chapters 2 and 3.
+    A capacitance C into an input of resistance R adds R C dv/dt, a common ground a share of v:
+    H. W. Ott, "Electromagnetic Compatibility Engineering", Wiley, 2009, chapters 2 and 3.
     """
 
     name = 'input_feedthrough'

@@ -147,7 +147,7 @@ class LoopHysteresis(Effect):
     and e_i is the output of a play of half width r_i that q drives.  The signal behind the effect
     is x - h, and G remains the linear part.  An element with r = 0 is the law of Bouc and Wen, and
     a lag along the path (Dahl) if skew = 0, too.  With gamma = 0 the element is a play.
-    `elastic` and `viscous` return to G what G had absorbed of the mean stiffness and damping.
+    `elastic` and `viscous` correct the mean stiffness and damping that G had absorbed.
 
     Notes
     -----

@@ -24,7 +24,7 @@ class SensorNonlinearity(Effect):
     -----
     Strain gauges are off by 0.1 .. 1 % of full scale, capacitive sensors by 0.01 .. 0.1 %:
     A. J. Fleming, "A review of nanometer resolution position sensors: operation and performance",
-    Sensors and Actuators A 190, 2013, doi:10.1016/j.sna.2012.10.016.  There the curve maps
+    Sensors and Actuators A 190, 2013, doi:10.1016/j.sna.2012.10.016.  The curve maps
     displacement to reading, and the error is the part that calibration leaves.
     """
 

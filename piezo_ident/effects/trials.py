@@ -92,8 +92,8 @@ class Trial:
         One value for each parameter; amplitudes are neutral.
     moves : tuple of (str, int or None)
         Amplitudes that are moved, one column each: name and, in a list, index.  Empty for an
-        effect without amplitudes.  Such an effect is switched on in `values`, and its column is
-        the difference between on and off.
+        effect without amplitudes, which `values` switch on: its column is the difference between
+        on and off.
     steps : tuple of float
         Step of each moved amplitude.
     """
