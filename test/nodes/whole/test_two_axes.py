@@ -226,7 +226,10 @@ def test_modes_that_run_away_end_the_drive_at_rest(lab, identified):
     path, sent = identified[1] / 'brittle.yaml', lab.collect('voltage')
     brittle_modes(pi.load(identified[1] / 'model.yaml')).save(path)
     limits = {'voltage_high': 11.0, 'slew': 1000.0, 'ramp_slew': 200.0}
-    lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), **limits})
+    # the model of the identifier would replace that of the file
+    own = {'model': 'no_model'}
+    params = {**AXES, 'sample_rate': RATE, 'model': str(path), **limits}
+    lab.start('feedforward', params, remaps=own)
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
     seen = len(lab.statuses('feedforward'))
     assert lab.call('feedforward/start')[0]
