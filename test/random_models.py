@@ -115,9 +115,13 @@ def smooth_motion(rng: np.random.Generator, model: StageModel, n: int = 3000) ->
 
 
 def random_shared_modes(
-    rng: np.random.Generator, axes: int = 2, softens: bool = True, strength: float = 0.1
+    rng: np.random.Generator,
+    axes: int = 2,
+    softens: bool = True,
+    strength: float = 0.1,
+    creeps: bool = False,
 ) -> SharedModes:
-    """Return coupled modes with plays in front and inside their loop, softening or not."""
+    """Return coupled modes with plays in front and inside their loop; some soften or creep."""
     order = 2 * int(rng.integers(axes, axes + 3))
     w, damping = rng.uniform(0.2, 1.2, order // 2), rng.uniform(0.01, 0.1, order // 2)
     poles = np.exp(w * (1j - damping))
@@ -150,8 +154,11 @@ def random_shared_modes(
         range=(0.5, 1.6),
         v0=rng.uniform(3.0, 6.0, axes),
         y0=rng.uniform(0.0, 1e-5, axes),
+        creep=rng.uniform(0.0, 0.03, (axes, 2)) if creeps else np.zeros((axes, 0)),
+        taus=np.array([200.0, 3000.0]) if creeps else np.zeros(0),
     )
-    return modes if modes.radius < 0.999 else random_shared_modes(rng, axes, softens, strength)
+    again = modes.radius >= 0.999
+    return random_shared_modes(rng, axes, softens, strength, creeps) if again else modes
 
 
 def random_modes_model(rng: np.random.Generator, axes: int = 2, **options) -> MultiAxisModel:

@@ -66,6 +66,8 @@ def export_modes(
     tables |= {'blocks': loop.blocks.reshape(-1, 4), 'v0': modes.v0, 'y0': modes.y0}
     if plays:
         tables |= {'mu': loop.mu, 'r': loop.r}
+    if modes.taus.size:
+        tables |= {'creep': loop.creep, 'share': loop.share}
     return render(
         'modes.h',
         **common_values(model, name, title),
@@ -77,6 +79,8 @@ def export_modes(
         levels=modes.levels,
         plays=plays,
         thresholds=len(modes.r),
+        creep=len(modes.taus),
+        middle=list(map(c_number, modes.v0)),
         settling=modes.settling,
         low=c_number(loop.low),
         high=c_number(loop.high),

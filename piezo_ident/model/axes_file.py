@@ -24,8 +24,8 @@ from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 
-#: versions of a model file with several axes, and of one with shared modes
-SCHEMA_VERSION, MODES_VERSION = 2, 3
+#: versions of a model file with several axes, with shared modes, and with modes that creep
+SCHEMA_VERSION, MODES_VERSION, CREEP_VERSION = 2, 3, 4
 
 
 def text_of(model: StageModel | MultiAxisModel) -> str:
@@ -35,8 +35,9 @@ def text_of(model: StageModel | MultiAxisModel) -> str:
     of_axes = {axis: model_to_dict(x) for axis, x in model.axes.items()}
     if model.modes is None:
         return yaml_text({'schema_version': SCHEMA_VERSION, 'axes': of_axes})
-    modes = plain(modes_to_dict(model.modes))
-    return yaml_text({'schema_version': MODES_VERSION, 'axes': of_axes, 'modes': modes})
+    modes = modes_to_dict(model.modes)
+    version = CREEP_VERSION if 'creep' in modes else MODES_VERSION
+    return yaml_text({'schema_version': version, 'axes': of_axes, 'modes': plain(modes)})
 
 
 def from_dict(data: Mapping[str, Any], name: str) -> StageModel | MultiAxisModel:
@@ -46,7 +47,7 @@ def from_dict(data: Mapping[str, Any], name: str) -> StageModel | MultiAxisModel
 
 def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
     """Build a model of several axes from the contents of its file; raise ModelError on a fault."""
-    check_version(data, name, MODES_VERSION)
+    check_version(data, name, CREEP_VERSION)
     axes = data['axes']
     if not (
         isinstance(axes, Mapping) and axes and all(isinstance(x, Mapping) for x in axes.values())

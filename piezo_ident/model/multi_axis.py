@@ -30,7 +30,7 @@ from piezo_ident.common.files import write_text
 from piezo_ident.model.axis_records import axis_record, columns_of, MOTION, motion_of, voltage_of
 from piezo_ident.model.free_run import free_run, predict
 from piezo_ident.model.modes.shared_modes import SharedModes
-from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.record.record import Piece, Record
 
 if TYPE_CHECKING:
@@ -174,7 +174,9 @@ class MultiAxisModel:
 
     def __repr__(self) -> str:
         lines = (f'  {axis}: {model!r}' for axis, model in self.axes.items())
-        shared = [] if self.modes is None else [f'  shared: {self.modes.linear.order} states']
+        shared = []
+        if self.modes is not None:
+            shared = [f'  shared: {self.modes.linear.order} states{self.modes.creep_told}']
         return '\n'.join(['MultiAxisModel:', *lines, *shared])
 
     @property
@@ -321,12 +323,13 @@ def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     List the model of each axis without the paths of the others.
 
     Beside shared modes, effects and known errors of a chain are no part of a prediction.  The
-    models then have no effects, and errors and band of the modes.
+    models then have creep, errors and band of the modes.
     """
     if isinstance(model, StageModel):
         return {'y': model}
     if model.modes is not None:
-        return {a: _beside_modes(x) for a, x in model.axes.items()}
+        creep = {a: model.modes.creep_of(j) for j, a in enumerate(sorted(model.axes))}
+        return {a: _beside_modes(x, *creep[a]) for a, x in model.axes.items()}
     return {a: model.own(a) for a in model.axes}
 
 
@@ -335,10 +338,12 @@ def judged_models(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel
     return alone(model) if shares_modes(model) else models_of(model)
 
 
-def _beside_modes(model: StageModel) -> StageModel:
+def _beside_modes(model: StageModel, gains: Array, taus: Array) -> StageModel:
     known = model.identification.get(SHARED_MODES)
     known = known if isinstance(known, Mapping) else {}
-    return replace(model, effects=(), identification=dict(known))
+    values = {'gain': gains.tolist(), 'time_constant': (taus / model.sample_rate).tolist()}
+    effects = (EffectSetting('creep', values),) if gains.size else ()
+    return replace(model, effects=effects, identification=dict(known))
 
 
 def with_own(

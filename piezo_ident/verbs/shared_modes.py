@@ -28,7 +28,8 @@ def modes_half_widths(
     Compute the half width of the band of each piece of a record with shared modes, by axis [m].
 
     `seen` has the record of every axis.  The voltage alone is known.  Where a piece does not start
-    at rest, the band contains all possible plays until the motion has swept them.
+    at rest, the band contains all possible plays until the motion has swept them.  The creep from
+    before is always in the band.
     """
     each, order = judged_models(model), sorted(model.axes)
     found: dict[str, list[Array]] = {axis: [] for axis in order}
@@ -40,6 +41,6 @@ def modes_half_widths(
         if not all(is_at_rest(each[a], x) for a, x in zip(order, pieces, strict=True)):
             spread = MemorySpread(modes).follow(v, y)
         for j, axis in enumerate(order):
-            band = BandStream(each[axis], level)
+            band = BandStream(each[axis], level, creep=False)
             found[axis].append(band.follow(v[:, j], y[:, j]) + level * spread[:, j])
     return {axis: tuple(half) for axis, half in found.items()}

@@ -217,7 +217,7 @@ def test_chains_of_several_axes_feel_one_another_from_any_time_on(chains):
 @needs_compiler
 def test_shared_modes_are_those_of_python_to_the_last_bit(tmp_path):
     rng = np.random.default_rng(6)
-    made = random_modes_model(rng)
+    made = random_modes_model(rng, creeps=True)
     # the order of the axes is not that of the alphabet
     model = pi.MultiAxisModel(dict(zip(('y_b', 'y'), made.axes.values(), strict=True)), made.modes)
     v = random_voltages(rng, model.modes, 2000)

@@ -29,6 +29,9 @@ typedef struct {
 {% if plays %}
     double memory[{{ signals }}][{{ thresholds }}]; /* outputs of the plays */
 {% endif %}
+{% if creep %}
+    double creep[{{ axes | length }}][{{ creep }}];
+{% endif %}
     double level; /* squared level of the signals that soften */
 } {{ p }}_state;
 
@@ -45,10 +48,20 @@ static inline void {{ p }}_step({{ p }}_state *s, const double v[{{ axes | lengt
     const double softening = piezo_held(sqrt(s->level), {{ low }}, {{ high }}) - 1.0;
     double squares = 0.0;
 {% endif %}
-    int i, j{% if plays %}, k{% endif %};
+    int i, j{% if plays or creep %}, k{% endif %};
 {% for column in columns %}
     u[{{ loop.index0 }}] = v[{{ column }}] - v0[{{ loop.index0 }}];
 {% endfor %}
+{% if creep %}
+    for (i = 0; i < {{ axes | length }}; i++) {
+        double crept = 0.0;
+        for (k = 0; k < {{ creep }}; k++) {
+            s->creep[i][k] = piezo_alive(s->creep[i][k] + share[k] * (u[i] - s->creep[i][k]));
+            crept += creep[i][k] * s->creep[i][k];
+        }
+        u[i] += crept;
+    }
+{% endif %}
 {% if signals %}
     for (j = 0; j < {{ signals }}; j++) {
         double z = 0.0;
@@ -111,7 +124,13 @@ static inline void {{ p }}_step({{ p }}_state *s, const double v[{{ axes | lengt
 static inline void {{ p }}_reset({{ p }}_state *s, const double v[{{ axes | length }}], double y[{{ axes | length }}])
 {
     {{ p }}_state settled;
-    int i{% if plays %}, k{% endif %};
+    int i{% if plays or creep %}, k{% endif %};
+{% if creep %}
+{% for column in columns %}
+    for (k = 0; k < {{ creep }}; k++)
+        s->creep[{{ loop.index0 }}][k] = v[{{ column }}] - {{ middle[loop.index0] }};
+{% endfor %}
+{% endif %}
     s->level = 1.0;
     for (i = 0; i < {{ order }}; i++)
         s->x[i] = 0.0;

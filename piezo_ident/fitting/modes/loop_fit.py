@@ -116,20 +116,20 @@ def _arrays(model: SharedModes) -> dict[str, Array]:
 
 
 def output_sensitivities(
-    model: SharedModes, parameters: Parameters, u: Array, run: Passage, skip: int = 0
+    model: SharedModes, parameters: Parameters, run: Passage, skip: int = 0
 ) -> NDArray[np.float32]:
     """
     Return dy/dtheta of `parameters`, shape (samples - skip, outputs, parameters).
 
-    `run` holds the signals of the loop under u.
+    `run` holds the signals of the loop.
     """
-    out = np.zeros((len(u) - skip, len(model.h), len(parameters)), np.float32)
+    out = np.zeros((len(run.u) - skip, len(model.h), len(parameters)), np.float32)
     kinds, rows, columns = parameters.kinds, parameters.rows, parameters.columns
-    u, loop = np.ascontiguousarray(u), model.loop
+    loop = model.loop
     for at in range(0, len(parameters), CHUNK):
         part = slice(at, at + CHUNK)
         answer = np.zeros((*out.shape[:2], len(kinds[part])), np.float32)
-        sensitivities(kinds[part], rows[part], columns[part], u, loop, run, skip, answer)
+        sensitivities(kinds[part], rows[part], columns[part], loop, run, skip, answer)
         out[:, :, part] = answer
     return out
 
@@ -230,11 +230,11 @@ class _Problem:
         total = many + outputs * each
 
         def one(target: Target) -> tuple[Array, Array]:
-            u, _, scale = target
+            *_, scale = target
             error, run = self._error(model, target)
             skip = self.warm_up
-            inner = output_sensitivities(model, self.parameters, u, run, skip)
-            plain = np.hstack([run.x[skip:], u[skip:], run.p[skip:]]).astype(np.float32)
+            inner = output_sensitivities(model, self.parameters, run, skip)
+            plain = np.hstack([run.x[skip:], run.u[skip:], run.p[skip:]]).astype(np.float32)
             hessian, gradient = np.zeros((total, total)), np.zeros(total)
             for o in range(outputs):
                 columns = np.hstack([inner[:, o], plain])

@@ -47,23 +47,27 @@ class Loop(NamedTuple):
     low: float
     high: float
     kappa: float
+    creep: Array
+    share: Array
 
 
 class LoopState(NamedTuple):
-    """State between two runs: x, outputs of the plays, and the squared level, shape (1,)."""
+    """State between two runs: x, outputs of the plays, squared level, shape (1,), and creep."""
 
     x: Array
     memory: Array
     level: Array
+    creep: Array
 
     @classmethod
     def at_zero(cls, loop: Loop) -> LoopState:
         """Make the state of a stage that never moved, at the level of the fit."""
-        return cls(np.zeros(len(loop.b)), np.zeros(loop.mu.shape), np.ones(1))
+        creep = np.zeros(loop.creep.shape)
+        return cls(np.zeros(len(loop.b)), np.zeros(loop.mu.shape), np.ones(1), creep)
 
 
 class Passage(NamedTuple):
-    """States, signals, pushes, plays, gates, squared level and outputs, one row a sample."""
+    """States, signals, pushes, plays, gates, squared level, outputs, and voltages with creep."""
 
     x: Array
     z: Array
@@ -72,25 +76,35 @@ class Passage(NamedTuple):
     gates: NDArray[np.uint8]
     level: Array
     y: Array
+    u: Array
 
 
 @ordered_kernel
-def trajectory(u: Array, loop: Loop, state: LoopState, run: Passage) -> int:
+def trajectory(v: Array, loop: Loop, state: LoopState, run: Passage) -> int:
     """
-    Run the loop over u, move `state` on, and write the signals into `run`.
+    Run creep and loop over v, move `state` on, and write the signals into `run`.
 
-    The result is the number of samples that were run: fewer than u if the stage runs away.
+    The result is the number of samples that were run: fewer than v if the stage runs away.
     """
     blocks, b, c, d, e, h = loop.blocks, loop.b, loop.c, loop.d, loop.e, loop.h
     f, g, mu, r, levels, kappa = loop.f, loop.g, loop.mu, loop.r, loop.levels, loop.kappa
-    xs, zs, ps, plays, gates, ls, ys = run
-    samples, inputs = u.shape
+    xs, zs, ps, plays, gates, ls, ys, u = run
+    samples, inputs = v.shape
     order, signals = e.shape
     thresholds = len(r)
     x, memory, level = state.x, state.memory, state.level[0]
     p = np.zeros(signals)
     new = np.zeros(order)
     for t in range(samples):
+        for i in range(inputs):
+            crept = 0.0
+            for k in range(len(loop.share)):
+                held = state.creep[i, k]
+                # a difference, so that an element at its input rests exactly
+                held = alive(held + loop.share[k] * (v[t, i] - held))
+                state.creep[i, k] = held
+                crept += loop.creep[i, k] * held
+            u[t, i] = v[t, i] + crept
         ls[t] = level
         softening = min(max(np.sqrt(level), loop.low), loop.high) - 1.0
         squares = 0.0
@@ -109,17 +123,17 @@ def trajectory(u: Array, loop: Loop, state: LoopState, run: Passage) -> int:
             else:
                 total = 0.0
                 for k in range(thresholds):
-                    v = memory[j, k]
+                    m = memory[j, k]
                     gates[t, j, k] = 0
-                    if z - v > r[k]:
-                        v = z - r[k]
+                    if z - m > r[k]:
+                        m = z - r[k]
                         gates[t, j, k] = 1
-                    elif z - v < -r[k]:
-                        v = z + r[k]
+                    elif z - m < -r[k]:
+                        m = z + r[k]
                         gates[t, j, k] = 1
-                    memory[j, k] = v
-                    plays[t, j, k] = v
-                    total += mu[j, k] * v
+                    memory[j, k] = m
+                    plays[t, j, k] = m
+                    total += mu[j, k] * m
                 p[j] = total
             ps[t, j] = p[j]
         for o in range(len(c)):
@@ -155,7 +169,6 @@ def sensitivities(
     kinds: NDArray[np.intp],
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
-    u: Array,
     loop: Loop,
     run: Passage,
     skip: int,
@@ -168,7 +181,7 @@ def sensitivities(
     """
     blocks, e, f, mu, c, h = loop.blocks, loop.e, loop.f, loop.mu, loop.c, loop.h
     levels, low, high, kappa = loop.levels, loop.low, loop.high, loop.kappa
-    xs, zs, ps, plays, gates, ls, _ = run
+    xs, zs, ps, plays, gates, ls, _, u = run
     single = np.float32
     samples = len(u)
     order, signals = e.shape

@@ -2,9 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Modes that several axes share, with softening and hysteresis inside their loop.
+Modes that several axes share, with creep, softening and hysteresis inside their loop.
 
-The state x follows the voltages u about `v0`:
+The voltages about `v0` creep as those of a chain do, see `piezo_ident.effects.creep`:
+
+    u_j = v_j - v0_j + sum_i c_ji l_ji,      l_ji follows v_j - v0_j with the time constant T_i
+
+The state x follows u:
 
     x(k+1) = A x(k) + B u(k) + E p(k)
 
@@ -71,6 +75,10 @@ class SharedModes:
         Between these s softens the stage; beyond them the softening stays.
     v0, y0 : ndarray, shapes (inputs,) and (outputs,)
         Voltages [V] and displacements [m] about which the equations hold.
+    creep : ndarray, shape (inputs, m)
+        Shares c_ji of the elements of creep.
+    taus : ndarray, shape (m,)
+        Their time constants T_i [samples].
     """
 
     linear: Modal
@@ -85,6 +93,8 @@ class SharedModes:
     range: tuple[float, float]
     v0: Array
     y0: Array
+    creep: Array
+    taus: Array
 
     @classmethod
     def of(cls, linear: Modal) -> SharedModes:
@@ -103,6 +113,8 @@ class SharedModes:
             range=(0.3, 2.0),
             v0=np.zeros(inputs),
             y0=np.zeros(outputs),
+            creep=np.zeros((inputs, 0)),
+            taus=np.zeros(0),
         )
 
     @property
@@ -119,12 +131,24 @@ class SharedModes:
         )
 
     @property
+    def creep_told(self) -> str:
+        """Creep of each axis in words that follow others; empty without creep."""
+        shares = ' and '.join(f'{100 * x:.2g}' for x in self.creep.sum(axis=1))
+        return f', with creep of {shares} % of the voltages' if self.taus.size else ''
+
+    def creep_of(self, axis: int) -> tuple[Array, Array]:
+        """Return shares and time constants [samples] of the creep of an axis, by its place."""
+        seen = self.creep[axis] != 0.0
+        return self.creep[axis][seen], self.taus[seen]
+
+    @property
     def loop(self) -> Loop:
         """Arrays and numbers for the compiled loops."""
         one, (low, high), kept = self.linear, self.range, math.exp(-1 / self.memory)
         arrays = one.blocks, one.b, one.c, one.d, self.e, self.h, self.f, self.g, self.mu, self.r
         blocks, b, c, d, e, h, f, g, mu, r = map(np.ascontiguousarray, arrays)
-        return Loop(blocks, b, c, d, e, h, f, g, mu, r, self.levels, low, high, kept)
+        creep, share = np.ascontiguousarray(self.creep), -np.expm1(-1 / self.taus)
+        return Loop(blocks, b, c, d, e, h, f, g, mu, r, self.levels, low, high, kept, creep, share)
 
     def a_at(self, s: float) -> Array:
         """Compute A at a level s, the plays at rest."""
@@ -182,19 +206,19 @@ class SharedModes:
         y = self.run(np.concatenate([u, u])).y[len(u) :]
         return np.asarray(y - y.mean(axis=0))
 
-    def run(self, u: Array, state: LoopState | None = None) -> Passage:
+    def run(self, v: Array, state: LoopState | None = None) -> Passage:
         """
-        Run the equations under voltages u about `v0`, and move `state` on.
+        Run the equations under voltages v about `v0`, and move `state` on.
 
         All states are zero before, if none is given.
         """
-        u = np.ascontiguousarray(u, dtype=np.float64)
-        if u.ndim != 2 or u.shape[1] != self.linear.b.shape[1]:
+        v = np.ascontiguousarray(v, dtype=np.float64)
+        if v.ndim != 2 or v.shape[1] != self.linear.b.shape[1]:
             raise DataError(
-                f'voltages of shape {u.shape} do not fit {self.linear.b.shape[1]} inputs; '
+                f'voltages of shape {v.shape} do not fit {self.linear.b.shape[1]} inputs; '
                 'give (samples, inputs)'
             )
-        n, q, k = len(u), *self.mu.shape
+        n, q, k = len(v), *self.mu.shape
         run = Passage(
             np.zeros((n, self.linear.order)),
             np.zeros((n, q)),
@@ -203,9 +227,10 @@ class SharedModes:
             np.zeros((n, q, k), np.uint8),
             np.zeros(n),
             np.zeros((n, len(self.h))),
+            np.zeros(v.shape),
         )
         loop = self.loop
-        done = trajectory(u, loop, LoopState.at_zero(loop) if state is None else state, run)
+        done = trajectory(v, loop, LoopState.at_zero(loop) if state is None else state, run)
         if done < n:
             raise ModelError(f'the shared modes run away at sample {done} of {n}')
         return run
@@ -214,22 +239,27 @@ class SharedModes:
 def modes_to_dict(modes: SharedModes) -> dict[str, Any]:
     """Write shared modes as the plain data of a model file."""
     data = {x.name: getattr(modes.linear, x.name) for x in fields(Modal)}
-    own = [x.name for x in fields(SharedModes) if x.name != 'linear']
+    without = {'linear'} if modes.taus.size else {'linear', 'creep', 'taus'}
+    own = [x.name for x in fields(SharedModes) if x.name not in without]
     return data | {name: getattr(modes, name) for name in own}
 
 
 def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
     """Build the shared modes of a number of axes from a model file, or raise ModelError."""
     try:
-        n, q, k = len(data['b']), len(data['f']), len(data['r'])
+        # an older file has no creep
+        data = {'creep': [], 'taus': [], **data}
+        n, q, k, m = len(data['b']), len(data['f']), len(data['r']), len(data['taus'])
         shapes = {
             'blocks': (n // 2, 2, 2), 'b': (n, axes), 'c': (axes, n), 'd': (axes, axes),
             'e': (n, q), 'h': (axes, q), 'f': (q, n), 'g': (q, axes), 'mu': (q, k), 'r': (k,),
             'v0': (axes,), 'y0': (axes,), 'range': (2,), 'levels': (), 'memory': (),
+            'creep': (axes, m), 'taus': (m,),
         }  # fmt: skip
         # a list without rows has lost its number of columns
         found = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
-        sound = all(np.isfinite(x).all() for x in found.values()) and found['memory'] > 0
+        sound = all(np.isfinite(x).all() for x in found.values())
+        sound = sound and all((found[x] > 0).all() for x in ('memory', 'taus'))
         levels, low, high = int(found['levels']), *map(float, found['range'])
         if not sound or n % 2 or not 0 <= levels <= q or not 0 <= low <= 1 <= high:
             raise ValueError('a number is out of range')
@@ -249,6 +279,8 @@ def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
         (low, high),
         found['v0'],
         found['y0'],
+        found['creep'],
+        found['taus'],
     )
     if not modes.radius < 1:
         raise ModelError(

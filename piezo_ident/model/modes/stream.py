@@ -69,8 +69,9 @@ class ModesStream:
         return y
 
     def _settled(self, rest: Array) -> LoopState:
-        """Settle under voltages of rest about those of the fit."""
+        """Settle under voltages of rest about those of the fit, all creep at rest."""
         modes, state = self.modes, LoopState.at_zero(self.modes.loop)
+        state.creep[:] = rest[0][:, None]
         run = modes.run(rest, state)
         if self._side:
             state.memory[:] = run.z[-1][:, None] + self._side * modes.r

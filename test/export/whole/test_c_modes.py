@@ -74,6 +74,7 @@ def cases():
     made['a direct path'] = pi.MultiAxisModel(
         two.axes, replace(two.modes, h=rng.normal(size=two.modes.h.shape) * 1e-7)
     )
+    made['creep'] = random_modes_model(rng, 3, creeps=True)
     made['a real loop'] = pi.MultiAxisModel(two.axes, replace(loop_stage(), v0=np.full(2, 4.0)))
     return {name: renamed(model) for name, model in made.items()}
 
