@@ -30,6 +30,7 @@ import warnings
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, IdentificationError, ModelError
+from piezo_ident.diagnosis.creep_of_modes import with_creep
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT, TAKES
 from piezo_ident.diagnosis.results import Diagnosis, Errors, FoundEffect, Unexplained
 from piezo_ident.fitting.modes.frequency_response import likeness
@@ -152,15 +153,18 @@ def find_shared_modes(
         None for a stage free of such hysteresis.
     """
     try:
-        found = _found(chains, sines, progress, tests)
-        return found and found._replace(modes=_placed(found.modes, records))
+        return _found(chains, sines, records, progress, tests)
     except (DataError, IdentificationError, ModelError):
         # the lines leave the order of the model open, or the modes run away on other motion
         return None
 
 
 def _found(
-    chains: MultiAxisModel, sines: Multisines, progress: Progress, tests: bool
+    chains: MultiAxisModel,
+    sines: Multisines,
+    records: Sequence[Record],
+    progress: Progress,
+    tests: bool,
 ) -> SharedModesFinding | None:
     every, v0 = sines
     taught, held_out = held_apart(every)
@@ -179,13 +183,14 @@ def _found(
     if law in IN_FRONT or not _beats(errors[law], errors['chains']):
         return None
     last = [record for part in taught for record in part] if tests else every
-    modes = loop_fit(fitted[law], last, iterations=LAST_STEPS)
+    modes = replace(loop_fit(fitted[law], last, iterations=LAST_STEPS), v0=v0)
+    modes = _placed(with_creep(modes, records), records)
     progress('shared modes', 1.0)
     judged = modes if tests else fitted[law]
     errors[law] = search.error(dict.fromkeys(search.groups, judged))
     missed = search.missed(judged)
     return SharedModesFinding(
-        replace(modes, v0=v0),
+        modes,
         law,
         errors,
         {record.name: missed[record.group] for record in every},
@@ -329,9 +334,9 @@ def with_shared_modes(
     taken = float(np.sqrt(max(before**2 - after**2, 0.0)))
     told = ', '.join(f'{law} {error:.3g} %' for law, error in finding.errors.items())
     sentence = (
-        f'The axes share modes with hysteresis inside their loop: {NAME} ({finding.law}). The '
-        f'error is {after:.3g} % of stroke, {before:.3g} % before. On multisines held out, in % '
-        f'of rms(y): {told}.'
+        f'The axes share modes with hysteresis inside their loop: {NAME} '
+        f'({finding.law}{finding.modes.creep_told}). The error is {after:.3g} % of stroke, '
+        f'{before:.3g} % before. On multisines held out, in % of rms(y): {told}.'
     )
     return replace(
         result,

@@ -133,7 +133,7 @@ class SharedRuns:
     Attributes
     ----------
     law : str
-        Law of the hysteresis inside their loop.
+        Law of the hysteresis inside their loop, and creep, in words.
     errors : mapping of str to float
         Errors of each law and of the chains on multisines held out, % of rms(y) of all axes.
     runs : tuple of PieceRun

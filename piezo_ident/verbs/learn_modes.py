@@ -139,7 +139,8 @@ def _of_modes(
     model, promise = judged_modes(chain.model, judged, held_out, chain.stroke)
     floor, records = noise_floor_of(own), [run.record for run in (*fitted, *unseen)]
     runs = [PieceRun(p.run.record, p.run.piece, p.y_hat, p.y_hat) for p in (*own, *others)]
-    shared = SharedRuns(finding.law, finding.errors, tuple(runs))
+    law = finding.law + finding.modes.creep_told
+    shared = SharedRuns(law, finding.errors, tuple(runs))
     result = replace(
         chain,
         model=model,

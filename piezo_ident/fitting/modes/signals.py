@@ -46,8 +46,7 @@ def with_input_plays(model: SharedModes, records: Sequence[PeriodicRecord]) -> S
 
 def _extension(model: SharedModes) -> tuple[Array, Array]:
     """Return F and G of G(0)^-1 y: the voltages that would hold the outputs at rest."""
-    gain = model.linear.response(np.ones(1, complex))[0].real
-    back = np.linalg.pinv(gain)
+    back = np.linalg.pinv(model.linear.gain)
     return back @ model.linear.c, back @ model.linear.d
 
 

@@ -62,6 +62,11 @@ class Modal:
         """Distance of the outermost pole from the origin; a stable model has less than 1."""
         return float(np.abs(np.linalg.eigvals(self.blocks)).max())
 
+    @property
+    def gain(self) -> Array:
+        """Gain at rest, shape (outputs, inputs)."""
+        return np.asarray(self.response(np.ones(1, complex))[0].real)
+
     def resolvent(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return (z - A)^-1 block by block, shape (k, n / 2, 2, 2)."""
         a, b = self.blocks[:, 0, 0], self.blocks[:, 0, 1]

@@ -145,7 +145,7 @@ def test_shared_modes_of_other_axes_are_refused():
 
 
 def test_the_observer_corrects_the_prediction_of_each_axis():
-    model, v = case(13, n=20_000)
+    model, v = case(13, n=20_000, creeps=True)
     # as a diagnosis writes them, in % of span
     known = {SHARED_MODES: {'diagnosis': {'errors': {'after': 0.01, 'worst': 0.01}}}}
     axes = {a: replace(x, identification=known) for a, x in model.axes.items()}
@@ -181,9 +181,9 @@ def test_the_feedforward_of_one_axis_refuses_shared_modes():
 LIMITS = GuardSettings(-1.0, 11.0, 40e3, 200.0, 0.0, RATE)
 
 
-def scanner(gain=1.0):
+def scanner(gain=1.0, creeps=False):
     """Return a stage of coupled modes with plays, and one of another gain of its second axis."""
-    model = random_modes_model(np.random.default_rng(2), strength=0.3)
+    model = random_modes_model(np.random.default_rng(2), strength=0.3, creeps=creeps)
     modes = model.modes
     y0, top = (ModesStream(modes).process(np.full((1, 2), v))[0] for v in (0.0, 10.0))
     known = {SHARED_MODES: {'diagnosis': {'errors': {'after': 0.02, 'worst': 0.02}}}}
@@ -362,7 +362,7 @@ def adapted(model, stage, v, correctors, start=0):
 
 
 def test_the_gain_of_each_coupled_axis_is_learnt(tmp_path):
-    model, stage = scanner(1.03)
+    model, stage = scanner(1.03, creeps=True)
     v = tracked(model, model, scans(model, 60_000))[1]
     correctors = [Corrector(adapt='gain') for _ in AXES[:2]]
     for one, axis in zip(correctors, AXES, strict=False):
