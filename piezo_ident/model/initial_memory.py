@@ -23,8 +23,10 @@ and lumps unknown plays into an offset.  Behind the early part it errs as this f
 is known, and 2 to 6 times more where it is not; within the early part 2 to 100 times more.  A
 smoother of its states (Rauch, Tung and Striebel) sees the later samples, too.  Within the early
 part it errs 0.6 to 1.3 times as this fit where the memory is known, and 1 to 5 times where it is
-not: an offset moves the whole early part, a play only until it is caught.  Records are therefore
-fitted.
+not: an offset moves the whole early part, a play only until it is caught.  With the sizes, zeros
+and correlated error of the observer as its priors this fit errs 0.02 to 3.4 times as much (10th
+and 90th percentile of 36 simulated records): better if the zero has moved, worse if the stage
+creeps otherwise than the model.  Records are therefore fitted, with weak priors.
 """
 
 from __future__ import annotations
