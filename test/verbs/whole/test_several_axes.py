@@ -145,7 +145,7 @@ def test_one_file_holds_all_axes(tmp_path):
 @pytest.mark.parametrize(
     ('text', 'names'),
     [
-        ('schema_version: 4\naxes: {}\n', 'schema 4'),
+        ('schema_version: 5\naxes: {}\n', 'schema 5'),
         ('axes: {}\n', 'each axis'),
         ('axes: 3\n', 'axes'),
         ('axes: {z: {}}\n', 'z'),
