@@ -38,18 +38,18 @@ ARGUMENTS = (
         'program',
         '',
         None,
-        'what /identifier/run and /excitation/start play: identification, survey, or a file',
+        'what /identifier/run and /excitation/start play: a shipped program, or a file',
     ),
     (
         'reference',
         '',
         None,
-        'a program in micrometres that the stage is to follow, instead of an identification',
+        'program in micrometres that the stage follows, instead of an identification',
     ),
     ('axes', '', None, 'names of further axes, with commas: b; they play the program in turn'),
     ('model', '', None, 'model file for the live model, and for the feedforward node'),
-    ('rate_factor', '', None, 'how many times faster than real time: 0.1 .. 4'),
-    ('sample_rate', '', None, 'of excitation and recording [Hz]; that of your driver'),
+    ('rate_factor', '', None, 'speed over real time: 0.1 .. 4'),
+    ('sample_rate', '', None, 'rate of excitation and recording [Hz]: the rate of your driver'),
     ('output', 'identified', None, 'folder into which /identifier/save writes'),
     ('record', 'false', ['true', 'false'], 'true: record all topics from the start on'),
     ('bag', '', None, 'bag to record; a number is added when it is there'),
@@ -63,7 +63,7 @@ ARGUMENTS = (
 
 
 def nodes(context):
-    given = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
+    args = {name: LaunchConfiguration(name).perform(context) for name, *_ in ARGUMENTS}
 
     def node(executable, **parameters):
         # a folder or a program may look like a number
@@ -72,43 +72,40 @@ def nodes(context):
             for name, value in parameters.items()
             if value not in ('', None)
         }
-        file = str(Path(given['config'], f'{executable}.yaml'))
+        file = str(Path(args['config'], f'{executable}.yaml'))
         return Node(
             package='piezo_ident',
             executable=executable,
             name=executable,
-            namespace=given['namespace'],
+            namespace=args['namespace'],
             parameters=[file, values] if values else [file],
-            ros_arguments=['--log-level', given['log_level']],
+            ros_arguments=['--log-level', args['log_level']],
             output='screen',
         )
 
     rates = {
-        name: float(given[name]) if given[name] else None
-        for name in ('rate_factor', 'sample_rate')
+        name: float(args[name]) if args[name] else None for name in ('rate_factor', 'sample_rate')
     }
-    axes = [name.strip() for name in given['axes'].split(',') if name.strip()] or None
-    found = [node('model', model=given['model'], axes=axes)]
-    if given['reference']:
+    axes = [name.strip() for name in args['axes'].split(',') if name.strip()] or None
+    started = [node('model', model=args['model'], axes=axes)]
+    if args['reference']:
         # the limits of the program hold, in micrometres too
         reference = {'quantity': 'reference', 'voltage_high': 1000.0, 'ramp_slew': 500.0}
-        found += [
-            node('excitation', program=given['reference'], axes=axes, **reference, **rates),
-            node('feedforward', model=given['model'], axes=axes, sample_rate=rates['sample_rate']),
+        started += [
+            node('excitation', program=args['reference'], axes=axes, **reference, **rates),
+            node('feedforward', model=args['model'], axes=axes, sample_rate=rates['sample_rate']),
         ]
     else:
-        found += [
-            node(
-                'excitation', program=given['program'], axes=axes, in_turn=axes and True, **rates
-            ),
-            node('identifier', program=given['program'], axes=axes, output=given['output']),
+        started += [
+            node('excitation', program=args['program'], axes=axes, in_turn=axes and True, **rates),
+            node('identifier', program=args['program'], axes=axes, output=args['output']),
         ]
-    if given['use_simulated_stage'] == 'true':
-        found.append(node('stage', stage=given['stage']))
-    if given['record'] == 'true':
-        values = {'output': given['bag'], 'sample_rate': rates['sample_rate'], 'axes': axes}
-        found.append(node('recorder', autostart=True, **values))
-    return found
+    if args['use_simulated_stage'] == 'true':
+        started.append(node('stage', stage=args['stage']))
+    if args['record'] == 'true':
+        values = {'output': args['bag'], 'sample_rate': rates['sample_rate'], 'axes': axes}
+        started.append(node('recorder', autostart=True, **values))
+    return started
 
 
 def generate_launch_description():

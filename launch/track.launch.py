@@ -23,7 +23,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'reference',
                 default_value='scan',
-                description='what the stage is to follow: a program in micrometres',
+                description='program in micrometres that the stage follows',
             ),
             # sees the arguments of this file, and those of the command line
             IncludeLaunchDescription(

@@ -18,7 +18,7 @@ from launch import LaunchDescription
 ARGUMENTS = (
     ('stage', 'two_axes', 'the stage to simulate: two_axes, or a file'),
     ('axes', 'b', 'names of further axes, with commas; they play the program in turn'),
-    ('sample_rate', '2000.0', 'of excitation and recording [Hz]; that of the stage'),
+    ('sample_rate', '2000.0', 'rate of excitation and recording [Hz]: the rate of the stage'),
     ('program', 'scanner', 'what /identifier/run and /excitation/start play'),
 )
 

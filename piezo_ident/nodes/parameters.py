@@ -82,10 +82,10 @@ _RATE = Declaration(
     read_only=True,
 )
 _LIMITS = (
-    _volts('voltage_low', 0.0, 'lowest voltage, whatever is asked for'),
-    _volts('voltage_high', 10.0, 'highest voltage, whatever is asked for'),
+    _volts('voltage_low', 0.0, 'lowest voltage ever sent or applied'),
+    _volts('voltage_high', 10.0, 'highest voltage ever sent or applied'),
 )
-_SLEW = Declaration('slew', 40000.0, 'steepest voltage, whatever is asked for', 'V/s', 1.0, 1e9)
+_SLEW = Declaration('slew', 40000.0, 'steepest voltage ever sent or applied', 'V/s', 1.0, 1e9)
 _REST = (
     _volts('rest', 0.0, 'rest voltage: before a stream, and after a stop or a silence'),
     Declaration(
@@ -93,8 +93,8 @@ _REST = (
     ),
 )
 _LISTENERS = (
-    Declaration('subscribers', 1, 'how many must listen before the first block', '1', 0, 100),
-    Declaration('wait_limit', 10.0, 'how long to wait for them', 's', 0.0, 3600.0),
+    Declaration('subscribers', 1, 'subscribers to wait for before the first block', '1', 0, 100),
+    Declaration('wait_limit', 10.0, 'longest wait for the subscribers', 's', 0.0, 3600.0),
 )
 _MODEL = Declaration('model', '', 'model file to start with; empty: wait for the topic')
 _AXES = Declaration(
@@ -103,9 +103,7 @@ _AXES = Declaration(
     'names of further axes, each with topics voltage_<name> and so on; empty names are left out',
     read_only=True,
 )
-_WINDOW = Declaration(
-    'window', 2.0, 'time over which the live or the tracking error is taken', 's', 0.1, 600.0
-)
+_WINDOW = Declaration('window', 2.0, 'window of the live or the tracking error', 's', 0.1, 600.0)
 _AUTOSTART = Declaration('autostart', False, 'start at once', read_only=True)
 
 EXCITATION = (
@@ -121,7 +119,7 @@ EXCITATION = (
     _AXES,
     Declaration('in_turn', False, 'whether the axes play one after the other'),
     Declaration('block_size', 100, 'samples in a block', '1', 2, 100_000),
-    Declaration('rate_factor', 1.0, 'speed of the stream, over real time', '1', 0.1, 4.0),
+    Declaration('rate_factor', 1.0, 'speed of the stream over real time', '1', 0.1, 4.0),
     *_LIMITS,
     *_REST,
     *_LISTENERS,
@@ -132,7 +130,7 @@ STAGE = (
     Declaration(
         'seed',
         -1,
-        'of the sensor noise; -1: that of the stage file',
+        'seed of the sensor noise; -1: the seed of the stage file',
         '1',
         -1,
         2**31 - 1,
@@ -157,14 +155,14 @@ IDENTIFIER = (
     Declaration(
         'solver',
         'least_squares',
-        'how the weights of H are found',
+        'solver of the weights of H',
         choices=('least_squares', 'swarm'),
     ),
-    Declaration('polish', False, 'whether least squares finish what the swarm found'),
+    Declaration('polish', False, 'whether least squares refine the result of the swarm'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
-    Declaration('delay', -1, 'delay that is used; -1: identified', 'samples', -1, 10_000),
-    Declaration('seed', 0, 'of everything that is drawn by chance', '1', 0, 2**31 - 1),
-    Declaration('swarm_size', 40, 'particles', '1', 2, 10_000),
+    Declaration('delay', -1, 'delay of the model; -1: identified', 'samples', -1, 10_000),
+    Declaration('seed', 0, 'seed of all random draws', '1', 0, 2**31 - 1),
+    Declaration('swarm_size', 40, 'number of particles', '1', 2, 10_000),
     Declaration('swarm_iterations', 20_000, 'most iterations of the swarm', '1', 1, 10_000_000),
     Declaration('output', '', 'folder into which ~/save writes; empty: none'),
     Declaration('capture_limit', 600.0, 'longest capture that is kept', 's', 1.0, 86_400.0),
@@ -176,7 +174,7 @@ IDENTIFIER = (
         0.5,
         3600.0,
     ),
-    Declaration('model', '', 'file of a model for ~/diagnose; empty: that identified here'),
+    Declaration('model', '', 'file of a model for ~/diagnose; empty: the identified model'),
     Declaration('sweeps_program', 'diagnosis', 'program of ~/diagnose for many motions'),
     Declaration('holds_program', 'holds', 'program of ~/diagnose for holds after steps'),
     Declaration('requests', 2, 'most programs that one ~/diagnose asks for', '1', 0, 10),
@@ -189,7 +187,7 @@ IDENTIFIER = (
         read_only=True,
     ),
     Declaration(
-        'nice', 5, 'by how much the work gives way to the capture', '1', 0, 19, read_only=True
+        'nice', 5, 'niceness of the process that does the work', '1', 0, 19, read_only=True
     ),
 )
 
@@ -230,7 +228,7 @@ MODEL = (
         'what the estimate learns: nothing, the gain, or the hysteresis and creep, too',
         choices=('off', 'gain', 'hysteresis'),
     ),
-    Declaration('output', '', 'file into which ~/save writes what was learnt; empty: none'),
+    Declaration('output', '', 'file into which ~/save writes the learnt model; empty: none'),
     Declaration(
         'interval',
         LEVEL,
@@ -298,7 +296,7 @@ FEEDFORWARD = (
     Declaration(
         'preview',
         0.02,
-        'time by which the stage follows the reference later',
+        'delay of the stage behind the reference',
         's',
         1e-5,
         10.0,
