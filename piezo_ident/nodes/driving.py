@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Base of a node that drives with a tracker: right to drive, ramps to rest, faults, safe end."""
+"""Base of a node that drives a stage: right to drive, ramps to rest, faults, safe end."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ DRIVING = tuple(NOW)
 
 class DrivingNode(LabNode):
     """
-    Holds the right to drive between a start and the rest after a stop.
+    Node with the right to drive, from a start until the stage rests after a stop.
 
-    A subclass sets a tracker before it drives, does its work in `work`, and publishes its state
-    in `report_state`.
+    A subclass sets a tracker before it drives, works in `work`, and publishes its state in
+    `report_state`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -62,7 +62,7 @@ class DrivingNode(LabNode):
         """Publish the status."""
 
     def work(self) -> str:
-        """Do the due work; return the next state if the right to drive has just come."""
+        """Work for one `PERIOD`; return the next state when the right to drive has come."""
         return ''
 
     def _take_right(self, tracker: Tracker) -> None:
@@ -111,13 +111,13 @@ class DrivingNode(LabNode):
         self._counts['samples'] += t.size
 
     def _note_second(self) -> None:
-        """Note who else publishes a voltage."""
+        """Note a second publisher of a voltage as a fault."""
         for tail, output in zip(self._tails, self._outputs, strict=True):
             if second := output.second() if output.is_open else '':
                 self._faults.note('second', f'second publisher {second} on voltage{tail}', 0)
 
     def _halt(self, state: str, text: str) -> None:
-        """Ramp to rest; then report a state with a text."""
+        """Ramp to rest, and report the state and the text at rest."""
         self._end = state, text
         self._begin_ramp()
         self._state = 'stopping'

@@ -5,8 +5,8 @@
 End a process on SIGINT or SIGTERM, from the first line of its code on.
 
 A Python signal handler waits for the main thread, which may be busy in a compiler.  The thread of
-this module hears a signal at once.  A process without anything to close ends at once.  Any other
-process gets some time to close, after which it is ended.
+this module hears a signal at once.  It then ends the process after the time that the process may
+take to close.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Ending:
     is_wanted : threading.Event
         Set by a signal.
     patience : float
-        Time that the process may take to end by itself after a signal [s].
+        Time that the process may take to close after a signal [s].
     on_wanted : callable
         Called once, in another thread, after `is_wanted` was set.
     unfinished : str
-        Work that is cut off if the process has to be ended; the exit code is then 1.
+        Work that the end of the process would cut off; the exit code is then 1.
     """
 
     def __init__(self) -> None:

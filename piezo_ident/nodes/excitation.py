@@ -9,7 +9,7 @@ A block is sent when its first sample is due on this clock.  `rate_factor` makes
 faster or slower.  The node waits for no listener; each listener reports its losses.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
-and SIGTERM ramp to rest within a second, if necessary steeper than `ramp_slew`.  A ramp runs in
+and SIGTERM end in a ramp of at most a second, if necessary steeper than `ramp_slew`.  Ramps run in
 real time.
 
 With `axes` the node drives several axes, each on its own topic with its own random signals:
@@ -17,10 +17,10 @@ With `axes` the node drives several axes, each on its own topic with its own ran
 begin, end and stop together.
 
 Two programs at once would tear the stage to and fro.  The node therefore refuses to start beside a
-second publisher on `voltage`, and reports a later one.  The middleware still lists a killed
-excitation for some 20 s.  The node takes a silent publisher under its own name for such a remnant,
-and listens for half a second before the first block.  Two nodes of one name that start at the same
-moment hear each other in their first second, and both end.
+second publisher on `voltage`, and reports a publisher that comes later.  The middleware lists a
+killed excitation for some 20 s.  A silent publisher of the node's own name counts as killed; the
+node listens for half a second before the first block.  Two nodes of one name that start together
+hear each other in their first second, and both end.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _name(sequence: Sequence) -> str:
 
 @dataclass(eq=False)
 class Playing:
-    """One program on its way, as the threads see it; a sequence for each axis."""
+    """State of a program that is played, shared by both threads; a sequence for each axis."""
 
     sequences: tuple[Sequence, ...]
     block_size: int
@@ -155,7 +155,7 @@ class ExcitationNode(LabNode):
         return self._built[1]
 
     def _in_unit(self, error: ConfigError) -> ConfigError:
-        """Replace V in the error of a program by the unit of the quantity."""
+        """Replace V in an error by the unit of the quantity."""
         unit = UNITS[self.values['quantity']][0]
         return ConfigError(_VOLTS.sub(unit, str(error)))
 
@@ -198,14 +198,14 @@ class ExcitationNode(LabNode):
         )
 
     def _other_rate(self, sequence: Sequence) -> str:
-        """Say if this node plays a program at another rate than the program names."""
+        """Return a note if the program names another rate than this node has, or ''."""
         own, rate = read_program(self.values['program']).sample_rate, sequence.sample_rate
         if own is None or own == rate:
             return ''
         return f'; at the {rate:g} Hz of this node, not at the {own:g} Hz of the program'
 
     def _unused(self, sequence: Sequence) -> str:
-        """Say if a program drives less than `NARROW` of the voltage range."""
+        """Return a note if a program drives less than `NARROW` of the voltage range, or ''."""
         low, high = float(sequence.v.min()), float(sequence.v.max())
         limits = self.values['voltage_low'], self.values['voltage_high']
         if self._quantity != 'voltage' or high - low >= NARROW * (limits[1] - limits[0]):
@@ -219,7 +219,7 @@ class ExcitationNode(LabNode):
         playing.stop.set()
         return f'ramping to {self.values["rest"]:g} {self._unit}'
 
-    # the thread that plays
+    # playing, in a thread of its own
 
     def _run(self, playing: Playing) -> None:
         try:

@@ -5,7 +5,7 @@
 Publish only while no other publisher sends: the right to drive.
 
 Publishers differ by their ids; two nodes may have the same name.  The middleware does not say
-which publisher sent a message.  But a listener gets each message once.  A node that hears more
+which publisher sent a message, but a listener gets each message once.  A node that hears more
 messages than it has sent therefore hears another publisher.
 """
 
@@ -32,8 +32,7 @@ MEET = 2.0
 YOUTH = 1.0
 #: time in which two nodes that start at the same moment hear each other's first blocks [s]
 TOGETHER = 1.0
-#: time between the match of a subscriber and the first block, so that both sides know the match
-#: [s]
+#: time from the match of a subscriber to the first block, so that both sides know the match [s]
 SETTLE = 0.1
 
 
@@ -46,9 +45,9 @@ class ExclusivePublisher:
     node : Node
     topic : str
     stays : bool, optional
-        Whether the publisher exists between two drives, too.  It then refuses to drive beside any
+        Whether the publisher also exists between two drives.  It then refuses to drive beside any
         publisher of another node name.  Without `stays` it drives beside a silent publisher, such
-        as an excitation between two programs, which in turn does not start beside this one.
+        as an excitation between two programs; that excitation does not start beside this one.
 
     Attributes
     ----------
@@ -165,12 +164,12 @@ class ExclusivePublisher:
         self._publisher.publish(to_message(samples))
 
     def others(self) -> list[str]:
-        """Return the nodes of the other publishers, without those of the own name."""
+        """Return the names of other nodes that publish on the topic."""
         own = self._node.get_fully_qualified_name()
         return sorted(set(publishers(self._node, self.topic).values()) - {own})
 
     def second(self) -> str:
-        """Return the node of a publisher that came after the right was granted, or ''."""
+        """Return the name of a node that publishes since the right was granted, or ''."""
         now = publishers(self._node, self.topic) if self._free else {}
         new = (name for gid, name in now.items() if gid not in self._known)
         return min((name for name in new if name != UNNAMED), default='')

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write news of a node to its log and its status, without repeating lasting problems."""
+"""Write events of a node to its log, without repeating problems that last."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAULT_SHOWN = 3.0
 MOST = 50
 #: longest line, as of a parameter that holds a program
 LONGEST = 500
-#: longest path in a text that has to be brief
+#: longest path in a shortened text
 PATH = 40
 
 _PATH = re.compile(r'(?:/[^\s/:;,]+){2,}')
@@ -60,7 +60,7 @@ class RecentFaults:
 
     @property
     def text(self) -> str:
-        """The messages of the last seconds; empty without any."""
+        """The messages of the last `FAULT_SHOWN` seconds; empty without faults."""
         now = time.monotonic()
         self._latest = {k: fault for k, fault in self._latest.items() if fault[1] > now}
         return '; '.join(message for message, _ in self._latest.values())
@@ -102,7 +102,6 @@ class Journal:
             # the text lists several problems
             for part in one_line(text).split('; '):
                 pattern = _NUMBER.sub('#', part)
-                # a part of an earlier line is old news
                 known = next((p for p in patterns if pattern in p), None)
                 if known is None and len(patterns) < MOST:
                     new.append(part)
@@ -121,7 +120,7 @@ class Journal:
 
 
 class FromPackage(logging.Handler):
-    """Handler that passes log records of the package, such as compiling, to a journal."""
+    """Handler that passes log records of the package to a journal."""
 
     def __init__(self, journal: Journal) -> None:
         super().__init__()
@@ -148,13 +147,13 @@ def shortened(text: str, longest: int) -> str:
     return one_line(_PATH.sub(end, text), longest)
 
 
-def shown(values: Mapping[str, Any]) -> str:
+def parameters_text(values: Mapping[str, Any]) -> str:
     """Format parameters, shortened: a parameter may hold a whole program."""
     return ', '.join(f'{name} = {shortened(str(value), 60)}' for name, value in values.items())
 
 
 def _fresh(told: dict[str, float]) -> dict[str, float]:
-    """Forget lines whose time is over."""
+    """Remove the lines whose time is over."""
     now = time.monotonic()
     for line in [line for line, until in told.items() if until <= now]:
         del told[line]

@@ -28,7 +28,7 @@ import piezo_ident
 from piezo_ident.common.errors import PiezoIdentError, printable
 from piezo_ident.live.guard import GuardSettings
 from piezo_ident.nodes.ending import ENDING
-from piezo_ident.nodes.journal import FromPackage, shortened, shown
+from piezo_ident.nodes.journal import FromPackage, parameters_text, shortened
 from piezo_ident.nodes.parameter_node import begin, ParameterNode, unknown_to
 from piezo_ident.nodes.parameters import NODES
 from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
@@ -40,7 +40,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-#: longest time for which a thread keeps the interpreter while another thread waits [s]
+#: longest time for which a thread keeps the interpreter from another thread [s]
 SWITCH = 2e-4
 #: longest time after a signal for finishing the start of a node, and for closing it [s]
 STARTING, CLOSING = 1.0, 1.8
@@ -88,7 +88,7 @@ class LabNode(ParameterNode):
         return super().create_timer(*args, **{'clock': self._steady, **kwargs})
 
     def tails(self) -> list[str]:
-        """Return the end of the topics of each axis: none of the first one, ``_b`` of axis b."""
+        """Return the suffix of the topics of each axis: '' of the first axis, ``_b`` of axis b."""
         return ['', *(f'_{name}' for name in self.values['axes'] if name)]
 
     # status, diagnostics, services
@@ -107,12 +107,12 @@ class LabNode(ParameterNode):
         """
         Publish the latched status: a `state` in one word, its progress [%] and a text for people.
 
-        The text is the last value.  The message begins with a figure and fits ``ros2 topic echo``.
+        The message is a short form of the text that fits ``ros2 topic echo``.
 
         Parameters
         ----------
         brief : str, optional
-            The text in few words, a number first; default: the progress and the text.
+            Short form of the text, a number first; default: the progress and the text.
         problems : str, optional
             Part of the text that goes to the log as a warning; default: the whole text.
         **values
@@ -187,7 +187,7 @@ class LabNode(ParameterNode):
         self.create_service(Trigger, f'~/{name}', answer, qos_profile=SERVICE)
 
     def reason(self, error: Exception) -> str:
-        """Return why a thread ended; an unexpected error goes to the log, too."""
+        """Return the text of an error that ended a thread; log an unexpected error."""
         if isinstance(error, PiezoIdentError):
             return str(error)
         _report(self, error, 'its work ends')
@@ -204,7 +204,7 @@ class LabNode(ParameterNode):
             for name, value in self.values.items()
             if (tuple(value) if isinstance(value, list) else value) != self._declared[name].default
         }
-        said = f'; set: {shown(changed)}' if changed else ''
+        said = f'; set: {parameters_text(changed)}' if changed else ''
         self.journal.tell(f'piezo_ident {piezo_ident.__version__} is up{said}')
         for line in unknown_to(self):
             self.journal.tell(line, WARN)
@@ -230,7 +230,7 @@ def run(make: Callable[[], LabNode]) -> int:
     Returns the exit code: 0 after a clean end, 1 when something failed at the end, 2 when the node
     could not start.
     """
-    # another thread, for example reading YAML, must not delay the executor for long
+    # another thread, such as a reader of YAML, must not delay the executor
     sys.setswitchinterval(SWITCH)
     ENDING.listen()
     ENDING.patience = STARTING

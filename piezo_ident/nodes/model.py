@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run a model beside the stage: prediction, residual, estimate and preview of each block."""
+"""Model node: prediction, band, residual and estimate of each block, and the preview."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
 OBSERVED = ('horizon', 'observe_gain', 'observe_drift', 'adapt')
 #: time for which a problem of the stream stays in the status [s], and most problems there
 REMEMBER, MOST = 5.0, 4
-#: longest wait of a block for the voltage of a further axis, and period of a look [s]
+#: longest wait of a block for the voltage of a further axis, and period of the time-outs [s]
 PATIENCE, LOOK = 0.2, 0.05
 
 
@@ -204,7 +204,7 @@ class ModelNode(LabNode):
         predictor.problem, known = '', predictor.memory_known
         prediction = predictor.process(samples)
         if self._is_lost:
-            # the earlier error says nothing about the present
+            # the live error belongs to the time before the loss
             for one in each:
                 one.error.clear()
         self._count += samples.t.size

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Load the models of a node, at its start and, in a thread, while it works."""
+"""Load the models of a node: at its start, and later in a thread."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class ModelLoader(Generic[T]):
     """
     Reads models from files and from the topic `model`.
 
-    A thread reads them, because reading YAML and compiling take longer than a block.  The thread
-    skips models that a newer one has overtaken.
+    A thread reads the models, because reading YAML and compiling take longer than a block.  If
+    several models wait, the thread reads the newest alone.
 
     Parameters
     ----------

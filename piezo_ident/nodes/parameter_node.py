@@ -18,7 +18,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from piezo_ident.common.errors import ConfigError, did_you_mean, PiezoIdentError
-from piezo_ident.nodes.journal import Journal, shown
+from piezo_ident.nodes.journal import Journal, parameters_text
 from piezo_ident.nodes.parameters import Declaration
 from piezo_ident.record.channels import role_of
 from rcl_interfaces.msg import (
@@ -75,9 +75,9 @@ def no_parameter(node: Node, name: str) -> str:
 
 
 def unknown_to(node: Node) -> Iterator[str]:
-    """Yield a line for each given parameter or argument that the node does not know."""
-    given = getattr(node, '_parameter_overrides', ())
-    yield from (no_parameter(node, name) for name in sorted(given) if not node.has_parameter(name))
+    """Yield a line for each parameter or argument of the command line that the node lacks."""
+    names = sorted(getattr(node, '_parameter_overrides', ()))
+    yield from (no_parameter(node, name) for name in names if not node.has_parameter(name))
     rest = remove_ros_args(args=sys.argv)[1:]
     if rest:
         yield f'{" ".join(rest)} is passed over; set parameters by --ros-args -p NAME:=VALUE'
@@ -109,7 +109,7 @@ class ParameterNode(Node):
     values : dict
         Values of all parameters.
     wanted : dict
-        The values that a request would lead to, while it is checked.
+        Values of all parameters after the request that is being checked.
     journal : Journal
     """
 
@@ -186,7 +186,7 @@ class ParameterNode(Node):
         """
         Set all parameters at once, or else as many as possible, in any order that works.
 
-        A loaded file may move limits that belong together, and it names them one by one.
+        A loaded file may move limits that depend on each other.
         """
         together = self._set(parameter_list)
         if together.successful:
@@ -205,7 +205,7 @@ class ParameterNode(Node):
         return [results[k] for k in range(len(parameter_list))]
 
     def _spelt(self, parameter: Parameter) -> Parameter:
-        """Convert a false to the choice off: YAML reads a bare off as false."""
+        """Convert false to the choice off, since YAML reads a bare off as false."""
         declaration = self._declared.get(parameter.name)
         if declaration and OFF in declaration.choices and parameter.value is False:
             return Parameter(parameter.name, Parameter.Type.STRING, OFF)
@@ -213,7 +213,7 @@ class ParameterNode(Node):
 
     def _set(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         parameters = [self._spelt(p) for p in parameters]
-        # a loaded file also names the read-only parameters
+        # a loaded file names read-only parameters, too
         wanted = [
             p
             for p in parameters
@@ -240,7 +240,7 @@ class ParameterNode(Node):
         changed = {p.name: p.value for p in parameters if p.name in self._declared}
         self.values.update(changed)
         if changed:
-            self.journal.tell(f'set: {shown(changed)}')
+            self.journal.tell(f'set: {parameters_text(changed)}')
             self.apply(changed)
 
     def refuse(self, name: str, value: Any) -> str | None:

@@ -106,7 +106,7 @@ class PlayerNode(LabNode):
         if self._is_replaying():
             raise PiezoIdentError('replaying already; call stop, and wait until it has ended')
         self._replay = Replay(bag, tuple(with_axes(self.values['topics'], self.values['axes'])))
-        # a daemon thread: ending it while it searches a large bag loses nothing
+        # a daemon thread, since an end while it searches a large bag loses nothing
         self._thread = threading.Thread(
             target=self._work, args=(self._replay,), name='replay', daemon=True
         )
@@ -168,7 +168,7 @@ class PlayerNode(LabNode):
             self._report(state, replay.failure, ERROR, replay.progress)
 
     def _looked_through(self, replay: Replay, bag: Bag) -> tuple[int, dict[str, str]]:
-        """Count the steps back of the chosen blocks; return the count and the chosen topics."""
+        """Count the chosen blocks whose time steps back; return the count and the topics."""
         chosen = chosen_topics(bag, replay.topics, self.resolve_topic_name)
         carried = {t: t for t in chosen if t in _carried(bag)}
 
@@ -334,7 +334,7 @@ def _carried(bag: Bag) -> dict[str, str]:
 
 
 def _profile(connection: Connection) -> QoSProfile:
-    """Return the recorded QoS of a topic, or the QoS of the graph if it is unknown."""
+    """Return the recorded QoS of a topic, or the QoS of the graph for an unknown QoS."""
     offered = getattr(connection.ext, 'offered_qos_profiles', None) or []
     reliable = all(o.reliability != QosReliability.BEST_EFFORT for o in offered)
     latched = bool(offered) and all(o.durability == QosDurability.TRANSIENT_LOCAL for o in offered)

@@ -9,8 +9,8 @@ empties them some fifty times a second and writes the bag.  The log time of a me
 at which the middleware received it, independent of thread and disk.
 
 The recorder subscribes to the topics of the graph before they have a publisher.  It subscribes to
-any other topic once it has a publisher, which tells the type.  A subscription requests the QoS
-that all publishers of its topic offer.
+any other topic once a publisher gives the type.  A subscription requests the QoS that all
+publishers of its topic offer.
 
 `max_bag_size` cuts a long recording into parts, each a bag of its own.  The subscriptions keep the
 messages that arrive between two parts.
@@ -36,7 +36,7 @@ from piezo_ident.record.bags.write import BagWriter
 POLL = 0.02
 #: time between two searches for publishers [s]
 LOOK = 0.1
-#: longest time for closing a bag before the node ends anyway; ros2 launch waits 5 s [s]
+#: longest time for closing a bag at the end of the node; ros2 launch waits 5 s [s]
 END = 4.0
 #: longest time for matching subscriptions with the existing publishers [s]
 MATCH_LIMIT = 2.0

@@ -5,18 +5,16 @@
 Stage node: simulates a stage sample by sample, at any block size.
 
 Each block of `voltage` passes the guard (`piezo_ident.live.guard`) and drives the stage.  The node
-answers by a block of `displacement` with the same t and segment.  `applied_voltage` is the voltage
-after the guard, before the converter rounds it.  The node publishes the displacement also if the
-guard has altered the command, so that nothing is lost.
+answers by a block of `displacement` with the same t and segment, also if the guard has altered the
+command.  `applied_voltage` is the voltage after the guard, before the converter rounds it.
 
-A stage of two axes has own topics for the second axis, such as `voltage_b`, `displacement_b` and
-`applied_voltage_b`, and a guard of its own.  The stream of the first axis rules: a block of
-`voltage` waits for the block of `voltage_b` with the same t, up to `PATIENCE` or half of
-`silence`.  A block that does not come in time leaves the last voltage of that axis in force.  A
-second axis without a publisher stays at rest.
+A second axis has a guard and topics of its own: `voltage_b`, `displacement_b`,
+`applied_voltage_b`.  A block of `voltage` waits for the block of `voltage_b` with the same t, for
+`PATIENCE` or half of `silence`.  Without that block the last voltage of the second axis stays in
+force.  A second axis without a publisher stays at rest.
 
-The stage never starts over.  Like a real stage it keeps its memory from stream to stream, and its
-own clock (for drift and hum) goes on.
+Like a real stage, the stage keeps its memory from stream to stream, and its own clock (for drift
+and hum) goes on.
 
 | in the stream | what the stage does | status |
 |---|---|---|
@@ -39,10 +37,10 @@ going on; what comes next is a new stream | WARN, unless it was at rest |
 | a second publisher | its blocks are refused until the stream of the first has ended: silent, \
 and its publisher gone or the stage at rest | WARN |
 
-`piezo_ident.live.sample_clock` tells how publishers are distinguished.  A loss of blocks beside a
-second publisher ends the stream, because either publisher may have sent the block after the loss.
+`piezo_ident.live.sample_clock` distinguishes publishers.  A loss of blocks beside a second
+publisher ends the stream, because either publisher may have sent the block after the loss.
 
-SIGINT and SIGTERM ramp to rest within a second, if necessary steeper than `ramp_slew`.
+SIGINT and SIGTERM end in a ramp of at most a second, if necessary steeper than `ramp_slew`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Empty subscriptions now and then, without the executor.
+Take the messages of subscriptions without the executor.
 
 The executor takes 0.3 ms to hand over one message.  A node that only collects blocks takes them
 itself in a fifth of this time.
@@ -108,13 +108,13 @@ def unspun(
 
 class BlockSubscriptions:
     """
-    Subscriptions to topics of blocks, which are collected.
+    Subscriptions to topics of blocks, emptied by `drain`.
 
     Parameters
     ----------
     node : Node
     take : callable
-        Gets topic, the key under which it was added, message, and information of the middleware.
+        Gets the topic, the key of `add`, the message, and the information of the middleware.
     """
 
     def __init__(
@@ -137,9 +137,9 @@ class BlockSubscriptions:
         ]
 
     def drain(self) -> None:
-        """Hand over all messages that have come."""
+        """Hand over all received messages."""
         for topic, (key, subscription) in self._subscriptions.items():
-            # no more at once than it keeps, or a flood on one topic starves the others
+            # one queue at most, or a flood on one topic starves the others
             for _ in range(STREAM.depth):
                 message = subscription.handle.take_message(Float64MultiArray, False)
                 if message is None:
@@ -181,7 +181,7 @@ class _Topic:
             self.losses.note(number, alone=self.is_followed)
         # a latched message may be replaced before it arrives, so its numbers may have gaps
         elif self.request is not None and not self.request.latched:
-            # the numbers of several legitimate publishers, as on /diagnostics, say nothing
+            # a topic may have several publishers, as /diagnostics, which number on their own
             if not self.is_followed:
                 self.losses.restart()
             self.losses.note(number, alone=True)
@@ -299,7 +299,7 @@ class RawSubscriptions:
                 if topic.subscription is None:
                     continue
                 handle, kind = topic.subscription.handle, topic.subscription.msg_type
-                # no more at once than it keeps, or a flood on one topic starves the others
+                # one queue at most, or a flood on one topic starves the others
                 for _ in range(STREAM.depth):
                     message = handle.take_message(kind, True)
                     if message is None:

@@ -19,8 +19,8 @@ MOST, LONGEST = 100_000, 200
 #: name for a node that the middleware has not discovered yet
 UNNAMED = 'a node without a name'
 
-#: samples: reliable, with the last five seconds of blocks on both sides, so that a reader that is
-#: stopped for a while loses no block
+#: samples: reliable, with the last five seconds of blocks on both sides, so that a reader that
+#: stops for a moment loses no block
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1000,
@@ -60,14 +60,13 @@ def to_message(samples: Samples) -> Float64MultiArray:
 
 def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     """
-    Convert a message to a block; `quantities` restricts its quantity, if they are named.
+    Convert a message to a block, of one of the `quantities` if they are named.
 
     All nodes call this function, so all refuse the same messages.  Values may be NaN or infinite;
-    each node documents its answer to them.
+    each node documents its answer.
 
-    DataError when the layout is not that of a block, contradicts the data, or exceeds the largest
-    block.  Also when the quantity is wrong, or the time stamps are not those of consecutive
-    samples.
+    DataError for another layout or quantity, a layout that contradicts the data, a block above the
+    largest size, and time stamps that are not consecutive.
     """
     dims, n = message.layout.dim, len(message.data)
     if n > 2 * MOST:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnose on the graph, request the excitation that would decide, and diagnose again."""
+"""Diagnose a capture, request the motion that would decide, and diagnose again."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Host(Protocol):
         """Play a program; `ended` gets None for a complete capture, else the reason."""
 
     def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
-        """Start a job whose result goes to `DiagnosisSession.take_outcome`."""
+        """Start a job; `DiagnosisSession.take_outcome` gets its result."""
 
     def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
         """Publish the last outcome, with notes on open questions."""
@@ -44,14 +44,14 @@ class DiagnosisSession:
     """
     Diagnoses a model until no question is open or no request is left.
 
-    Each diagnosis begins with the `given` model; `diagnosis` is the last one of this model.
+    Each diagnosis begins with the same `model`; `diagnosis` is the last result.
     """
 
     def __init__(self, host: Host, capture: Capture) -> None:
         self._host, self._capture = host, capture
-        self.given: StageModel | MultiAxisModel | None = None
+        self.model: StageModel | MultiAxisModel | None = None
         self.diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
-        # samples up to here went into the model and cannot test it
+        # the mark up to which samples went into the model, and cannot test it
         self._used: Mapping[str, int] = {}
         self.drop()
 
@@ -61,7 +61,7 @@ class DiagnosisSession:
 
         `used` is the `Capture.mark` up to which the capture served to identify the model.
         """
-        self.given, self.diagnosis, self._used = model, None, used
+        self.model, self.diagnosis, self._used = model, None, used
 
     def forget(self) -> None:
         """Note that the capture was cleared."""
@@ -83,15 +83,15 @@ class DiagnosisSession:
         """
         Begin; return a message about the first step.
 
-        PiezoIdentError when the model is missing, or data and excitation are both missing.
+        PiezoIdentError without a model, or without both data and an excitation.
         """
         self.drop()
-        if self.given is None:
+        if self.model is None:
             raise PiezoIdentError(
                 "there is no model to diagnose; call ~/run or ~/identify first, or set 'model'"
             )
         if self.seconds:
-            self._diagnose(self.given)
+            self._diagnose(self.model)
             return 'diagnosis has begun'
         wanted, hindrance = next_experiment(None), self._hindrance()
         if wanted is None or hindrance:
@@ -109,11 +109,11 @@ class DiagnosisSession:
             return f'no more than {most} requests are allowed'
         return '' if self._host.can_excite() else 'there is no excitation and no stage'
 
-    def _diagnose(self, given: StageModel | MultiAxisModel) -> None:
+    def _diagnose(self, model: StageModel | MultiAxisModel) -> None:
         settings = DiagnosisSettings(seed=self._host.values['seed'])
         snapshot = self._capture.snapshot(self._used)
         job = functools.partial(
-            diagnose_capture, snapshot, given, tuple(self._requested), settings
+            diagnose_capture, snapshot, model, tuple(self._requested), settings
         )
         self._host.start_diagnosis(job, self.seconds)
 
@@ -127,8 +127,8 @@ class DiagnosisSession:
         return f'asking for {wanted.kind}: {wanted.reason}'
 
     def _excited(self, reason: str | None) -> None:
-        if reason is None and self.given is not None:
-            self._diagnose(self.given)
+        if reason is None and self.model is not None:
+            self._diagnose(self.model)
         elif self._last is None:
             self._host.fail(f'there is nothing to diagnose: {reason}')
         else:

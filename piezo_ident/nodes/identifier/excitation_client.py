@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Set a program of the excitation, start it, and follow it to its end, for the identifier.
+Have the excitation play a program for the identifier, and follow the program to its end.
 
 The client restores the earlier program of the excitation once it has answered to the start.
 Otherwise the next ``~/start`` of a person would play the program of the identifier.
@@ -27,12 +27,12 @@ from std_srvs.srv import Trigger
 
 #: states of the excitation before the beginning and after the end of a program
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
-#: state before the first status of this run: an earlier status is about an earlier run
+#: state before the first status of this run; an older status is about an older run
 _UNHEARD = 'unheard'
 #: longest travel of the last blocks after the excitation says done [s]
 _TAIL = 1.0
-#: longest time for which a warning stage may leave the voltage unanswered [s]: it may refuse the
-#: rate, for example
+#: longest time for which a stage that warns may leave the voltage unanswered [s]: such a stage may
+#: refuse the rate
 _UNANSWERED = 3.0
 #: time after which an unanswered request is sent again [s]
 _AGAIN = 2.0
@@ -98,7 +98,7 @@ class ExcitationClient:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the answer to the start of the excitation is awaited."""
+        """Whether the excitation has not yet answered to the start."""
         return self._phase == 'starting'
 
     @property
@@ -182,7 +182,7 @@ class ExcitationClient:
             return
         self._sign = time.monotonic()
         if self._state not in _RESTING:
-            # only such a status is about this run: an older latched status says it is at rest
+            # an older latched status says that the excitation is at rest
             self._active = True
             try:
                 self.progress = float(values.get('progress', '0'))

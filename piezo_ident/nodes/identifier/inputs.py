@@ -19,15 +19,15 @@ from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantit
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-#: further quantities that the blocks of a topic may carry, beside the name of the topic
+#: quantities of the blocks of a topic, beside the name of the topic
 _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 
 
 class Inputs:
     """
-    Streams of a capture.
+    Subscriptions that fill a capture.
 
-    `channels` are topics of further axes and channels; `passed` counts the samples on each topic.
+    `channels` are topics of further axes and channels; `passed` counts the samples of each topic.
     """
 
     def __init__(self, node: Node, capture: Capture, channels: Sequence[str]) -> None:

@@ -4,8 +4,8 @@
 """
 Jobs of the worker process of the identifier, independent of ROS.
 
-Each job is a function of this module, which is sent to another process.  The worker adds its last
-argument, `tick`.
+The node sends a function of this module to the worker process, which adds the last argument,
+`tick`.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationOutcome(Outcome):
-    """Result of an identification, or of one of its steps, with the results of `steps` so far."""
+    """Result of an identification, or of a step, with the results of `steps` so far."""
 
     steps: Steps | None = None
     identification: Identification | EachAxis[Identification] | None = None
@@ -110,11 +110,11 @@ class DiagnosisOutcome(Outcome):
     """
     Result of a diagnosis; the `diagnosis` is None if the capture lacks motion.
 
-    `given` is the given model as YAML, `wanted` an experiment that would decide an open question.
+    `judged` is the diagnosed model as YAML, `wanted` an experiment that would decide a question.
     """
 
     diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
-    given: str = ''
+    judged: str = ''
     wanted: Experiment | None = None
 
 
@@ -149,7 +149,7 @@ def percent_of(step: str, share: float, axes: Sequence[str] = ('y',)) -> float:
     """
     Return the progress of the whole work in percent.
 
-    The step of a stage of several axes begins with the name of its axis, one of `axes` in turn.
+    With several axes the name of a step begins with the name of its axis, one of `axes` in turn.
     """
     axis, _, what = step.rpartition(': ')
     low, high = _SHARES.get(what, (0.0, 1.0))
@@ -169,9 +169,8 @@ def identify_capture(
     """
     Make a record of a capture and identify it.
 
-    `which` names a step, or is ``all``.  `steps` are the results of earlier steps, for single
-    steps only; `before` is an earlier model of this stage, and `axes` are the names of further
-    axes.
+    `which` names a step, or is ``all``.  A single step goes on from the results `steps` of earlier
+    steps.  `before` is an earlier model of this stage, and `axes` are the names of further axes.
     """
     tick('record', 0.0)
     record = snapshot.record('capture')
@@ -266,7 +265,7 @@ def _sentence(steps: Steps) -> str:
 
 def diagnose_capture(
     snapshot: Snapshot,
-    given: StageModel | MultiAxisModel,
+    model: StageModel | MultiAxisModel,
     asked: tuple[Kind, ...],
     settings: DiagnosisSettings,
     tick: Tick,
@@ -274,15 +273,15 @@ def diagnose_capture(
     """
     Make records of a capture and diagnose a model by them.
 
-    The `snapshot` is without the samples that the model was identified from.  The excitation has
-    played the experiments `asked` already.
+    The `snapshot` lacks the samples that the model was identified from.  The excitation has played
+    the experiments `asked` before.
     """
     tick('record', 0.0)
     record = snapshot.record('capture')
-    records = [r for r in records_of_runs(record) if _is_driven(given, r)]
+    records = [r for r in records_of_runs(record) if _is_driven(model, r)]
     if not records:
         return DiagnosisOutcome(wanted=next_experiment(None, asked=asked))
-    result = diagnose(given, records, settings, progress=tick)
+    result = diagnose(model, records, settings, progress=tick)
     # every run is a record of its own, so a restart of the clock is harmless
     faults = tuple(fault for fault in record.faults if fault.name != 'restart')
     result = mapped(result, lambda _, x: replace(x, faults=(*faults, *x.faults)))
@@ -296,7 +295,7 @@ def diagnose_capture(
         figures=_figures(result, _verdict_of),
         report=json_text(result),
         model=text_of(result.model),
-        given=text_of(given),
+        judged=text_of(model),
         warnings=sum(len(x.warnings) + sum(not f.is_note for f in x.faults) for x in each),
         wanted=next(filter(None, wishes), None),
     )

@@ -43,7 +43,7 @@ from std_msgs.msg import String
 
 Result = IdentificationOutcome | DiagnosisOutcome | str
 
-#: time between two looks at the run of the excitation [s]
+#: time between two polls of the excitation [s]
 POLL = 0.05
 #: time between two reports of the length of the capture [s]
 TELL = 0.5
@@ -218,7 +218,7 @@ class IdentifierNode(LabNode):
             settings,
             which,
             self._steps,
-            self._session.given,
+            self._session.model,
             self._axes,
         )
         self._task = 'identification' if which == 'all' else f'identification of the {which}'
@@ -297,7 +297,7 @@ class IdentifierNode(LabNode):
     def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
         """Publish report, model and verdict."""
         self._report.publish(String(data=outcome.report))
-        if outcome.model != (self._published or outcome.given):
+        if outcome.model != (self._published or outcome.judged):
             self._publish_model(outcome.model)
         count = outcome.warnings
         text = with_warnings('; '.join([outcome.message.rstrip('.'), *notes]), count)

@@ -21,8 +21,8 @@ class Worker:
     """
     Runs one job at a time without delaying the caller.
 
-    A larger niceness `nice` leaves more time to other processes.  The process calls `warm_up`
-    first, a function of a module.
+    A larger niceness `nice` leaves more time to other processes.  The process first calls
+    `warm_up`, a function of a module.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
