@@ -4,9 +4,9 @@
 """
 Keep incoming blocks for a record, within bounds of time and memory.
 
-The record is made by the same functions as the record of a bag: `piezo_ident.record.join` and
-`piezo_ident.record.assemble` deal with faulty samples.  A capture also reports messages that could
-not be read, and the time that was dropped to stay within the bounds.
+`piezo_ident.record.join` and `piezo_ident.record.assemble` make the record, as that of a bag, and
+deal with faulty samples.  A capture also reports unreadable messages, and the time that it dropped
+to stay within the bounds.
 """
 
 from __future__ import annotations
@@ -27,17 +27,16 @@ from piezo_ident.record.stream import BlockStream
 
 #: kinds of segments that the three steps of the identification need
 NEEDED = ('step', 'noise', 'triangle')
-#: most samples and blocks that are kept of a topic, and most labels that are counted
+#: most kept samples and blocks of a topic, and most counted labels
 MOST_SAMPLES, MOST_BLOCKS, MOST_LABELS = 50_000_000, 2_000_000, 500
 
 
 def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -> None:
     """
-    Refuse a record that lost too much of a segment that the three steps need, with a DataError.
+    Raise DataError if a record lost too much of a segment that the three steps need.
 
     Time missing between two pieces counts for the segments on both sides.  The time `sent` [s] of
-    each kind of segment in the voltage reveals samples that are missing at either end of the
-    record.
+    each kind of segment in the voltage reveals missing samples at the ends of the record.
     """
     present = {kind: sum(p.duration for p in record.find(kind)) for kind in NEEDED}
     missing = dict.fromkeys(NEEDED, 0.0)
@@ -69,7 +68,7 @@ def refuse_incomplete(record: Record, sent: Mapping[str, float] | None = None) -
 
 
 def refuse_missing(record: Record, axes: Sequence[str]) -> None:
-    """Refuse a record without voltage or displacement of a further axis, with a DataError."""
+    """Raise DataError for a record without voltage or displacement of a further axis."""
     topics = [f'{what}_{axis}' for axis in axes for what in ('voltage', 'displacement')]
     missing = [
         topic
@@ -101,18 +100,18 @@ def records_of_runs(record: Record) -> list[Record]:
 
 
 class _Topic:
-    """Kept blocks of one topic, its clock, and counts of samples that were dropped."""
+    """Kept blocks of one topic, its clock, and the number of dropped samples."""
 
     def __init__(self) -> None:
         self.stream, self.clock = BlockStream(), BlockClock()
-        # the number of samples at each restart of the clock, and the number of dropped samples
+        # number of samples at each restart of the clock; number of dropped samples
         self._runs: list[int] = []
         self.dropped = self._newest = self.not_finite = 0
-        # samples of ramps of the driver within a command that went on, and since the last block
+        # samples of ramps to rest between commands, and of a ramp since the last command
         self.ramped = self._ramp = 0
 
     def add(self, samples: Samples, arrival: int) -> None:
-        """Take a block; the record reports blocks with impossible times."""
+        """Take a block; the record will report impossible times."""
         t, restarts = samples.t, self.clock.restarts
         if samples.segment == RAMPED:
             self._ramp += t.size
@@ -150,13 +149,13 @@ class _Topic:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of a capture at one moment; its record can be made later, in another thread."""
+    """A copy of a capture at one moment, whose record another thread may make later."""
 
     streams: Mapping[str, BlockStream]
     faults: tuple[Fault, ...] = ()
 
     def record(self, name: str = 'capture') -> Record:
-        """Make the record; DataError if voltage or displacement are missing, or need a guess."""
+        """Make the record; DataError without voltage or displacement, or for unusable data."""
         for key, cure in (
             ('voltage', 'start the excitation, or replay a bag'),
             ('displacement', 'is the stage running, and does it publish on this topic?'),
@@ -169,7 +168,7 @@ class Snapshot:
         return record_of_streams(heard, name=name, faults=self.faults)
 
     def sent(self) -> dict[str, float]:
-        """Return the time [s] of each kind of segment in the voltage, repeats not counted."""
+        """Return the time [s] of each kind of segment in the voltage, without repeats."""
         stream = self.streams['voltage']
         t = stream.times
         names, starts = stream.labels()
@@ -188,8 +187,8 @@ class Capture:
     Parameters
     ----------
     limit : float, optional
-        Longest measured time that is kept [s].  A longer capture drops the oldest run of the
-        sample clock, or the oldest tenth of a single run.
+        Longest kept time [s].  A longer capture drops the oldest run of the sample clock, or the
+        oldest tenth of a single run.
     """
 
     def __init__(self, limit: float = 600.0) -> None:
@@ -206,10 +205,10 @@ class Capture:
 
     def add(self, key: str, samples: Samples, arrival: int) -> None:
         """
-        Take a block that came at a time `arrival` [ns] of a clock that all topics share.
+        Take a block that arrived at a time `arrival` [ns] of a clock that all topics share.
 
-        The `key` is ``voltage``, ``displacement``, ``applied_voltage``, the same with ``_<name>``
-        behind it for a further axis, or ``x_<name>``.
+        The `key` is ``voltage``, ``displacement`` or ``applied_voltage``, with the suffix
+        ``_<name>`` for a further axis, or ``x_<name>``.
         """
         topic = self._topics.setdefault(key, _Topic())
         topic.add(samples, arrival)
@@ -233,12 +232,12 @@ class Capture:
         return {key: topic.total for key, topic in self._topics.items()}
 
     def seconds_since(self, mark: Mapping[str, int], key: str = 'voltage') -> float:
-        """Measured time of a topic after a mark, as far as it is kept [s]."""
+        """Return the kept time of a topic after a mark [s]."""
         topic = self._topics.get(key, _Topic())
         return topic.seconds(min(topic.stream.n, topic.total - mark.get(key, 0)))
 
     def snapshot(self, since: Mapping[str, int] | None = None) -> Snapshot:
-        """Copy the capture at little cost, from the mark `since` on; see `mark`."""
+        """Copy the capture from the mark `since` on, without copying samples."""
         faults = [
             Fault('unreadable_block', f'on {key}, last: {reason}', count, 'dropped')
             for key, (count, reason) in self._unreadable.items()
@@ -258,12 +257,12 @@ class Capture:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Topics of the capture, in order of appearance."""
+        """Keys of the topics, in order of appearance."""
         return tuple(self._topics)
 
     @property
     def n(self) -> int:
-        """Samples of the voltage that are kept."""
+        """Number of kept samples of the voltage."""
         return self._topics['voltage'].stream.n if 'voltage' in self._topics else 0
 
     def last_time(self, key: str) -> float:
@@ -271,12 +270,12 @@ class Capture:
         return self._topics[key].clock.last if key in self._topics else float('nan')
 
     def seconds_of(self, key: str) -> float:
-        """Return the measured time of a topic that is kept [s]."""
+        """Return the kept time of a topic [s]."""
         return self.seconds_since({}, key)
 
     @property
     def seconds(self) -> float:
-        """Measured time of the voltage that is kept [s]."""
+        """Kept time of the voltage [s]."""
         return self.seconds_of('voltage')
 
     @property
@@ -286,7 +285,7 @@ class Capture:
 
     @property
     def lost(self) -> Mapping[str, int]:
-        """Samples that never came, by topic, as its sample clock tells."""
+        """Number of missing samples of each topic, by its sample clock."""
         return {key: topic.clock.lost for key, topic in self._topics.items()}
 
     @property

@@ -17,8 +17,8 @@ from piezo_ident.model.metrics import expected_error, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
-#: share of the predictions of a second that must meet a displacement, and number of seconds that
-#: may fall short: the first second of a stream is incomplete
+#: least share of the predictions of a second that meet a displacement, and number of seconds
+#: allowed below it: the first second of a stream is incomplete
 MET, PATIENCE = 0.5, 1
 
 
@@ -35,14 +35,14 @@ class AxisComparison:
         Get the name of a quantity, ``residual`` or ``estimate``, and a block of it; the
         corrections of the estimate by their names; a doubt about the readings as text.
     knows : callable
-        Says whether the run of the model knows the memory of its plays.
+        Returns whether the run of the model knows the memory of its plays.
 
     Attributes
     ----------
     error, left : LiveError
-        Of the prediction, and of the estimate.
+        Live errors of the prediction and of the estimate.
     again : int
-        Samples of displacement that came again in the last second.
+        Repeated or late samples of displacement in the last second.
     room : float or None
         Distance of the voltage of the last second from the ends of the range of the model [V].
     """
@@ -61,7 +61,7 @@ class AxisComparison:
         self.matcher, self._estimates = Matcher(), Matcher()
         self.error, self.left = LiveError(window), LiveError(window)
         self.model: StageModel | None = None
-        # samples of the last second, and seconds in which too few were compared
+        # samples of the last second; number of seconds with too few comparisons
         self._predicted, self._measured, self._compared, self._unmet = 0, 0, 0, 0
         self.again = self._late = 0
         self.room: float | None = None
@@ -90,7 +90,7 @@ class AxisComparison:
     # blocks
 
     def drove(self, v: Array) -> None:
-        """Take the next voltages [V], shape (n,)."""
+        """Take the next voltages [V], shape (n,), for `room`."""
         numbers, (low, high) = v[np.isfinite(v)], self._ends
         self._ends = float(numbers.min(initial=low)), float(numbers.max(initial=high))
 
@@ -141,9 +141,9 @@ class AxisComparison:
 
     def look(self, is_silent: bool) -> str:
         """
-        End a second; say why its predictions cannot be compared, or nothing.
+        End a second; return why its predictions cannot be compared, or ''.
 
-        `is_silent` says that voltage came and no prediction was made.
+        `is_silent` says that voltage came without a prediction.
         """
         (low, high), self._ends, self.room = self._ends, (np.inf, -np.inf), None
         if self.model is not None and low <= high:
@@ -193,19 +193,19 @@ class AxisComparison:
 
     @property
     def problems(self) -> list[str]:
-        """List what was wrong with readings and voltage of the last second."""
-        found = [self.left_out]
+        """List the faults of readings and voltage in the last second."""
+        faults = [self.left_out]
         if self.again:
             about = 'samples of displacement came again or out of turn: do two nodes publish it?'
-            found.append(f'{self.again} {about}')
+            faults.append(f'{self.again} {about}')
         span = 0.0 if self.model is None else float(np.ptp(self.model.scaling.range))
         if self.room is not None and self.room < -1e-3 * span:
-            found.append(f'the voltage leaves the identified range by {-self.room:.3g} V')
-        return [text for text in found if text]
+            faults.append(f'the voltage leaves the identified range by {-self.room:.3g} V')
+        return [text for text in faults if text]
 
     @property
     def left_out(self) -> str:
-        """Say how many wild readings the live error leaves out."""
+        """Text on the number of wild readings that the live error leaves out, or ''."""
         n = self.error.outliers
         return f'{n} wild readings of displacement are left out of the live error' if n else ''
 
@@ -226,7 +226,7 @@ class AxisComparison:
 
 
 def finite_readings(samples: Samples) -> Samples:
-    """Leave out the samples that are no numbers."""
+    """Return a block without its NaN and infinite samples."""
     usable = np.isfinite(samples.values)
     if usable.all():
         return samples

@@ -4,14 +4,13 @@
 """
 Estimate the displacement of a running axis from its prediction and earlier displacement.
 
-The part that the axis feels of other axes is taken off prediction and displacement, and added to
-the estimate: gain, hysteresis and creep are those of the motion by its own voltage.
+Gain, hysteresis and creep belong to the motion of an axis by its own voltage.  The motion by other
+axes is therefore subtracted from prediction and displacement, and added to the estimate.
 
 An observer corrects a sample of the prediction by displacement at least a horizon earlier.  The
-sample waits until this displacement has come or is known to be missing.  It is missing if later
-displacement has come, or if none came for `PATIENCE`.  The order in which prediction and
-displacement arrive therefore makes no difference.  Samples that still wait when the stream starts
-over are dropped.
+sample waits until this displacement has come or is missing: later displacement has come, or none
+for `PATIENCE`.  The order in which prediction and displacement arrive therefore makes no
+difference.  Samples that still wait when the stream starts over are dropped.
 """
 
 from __future__ import annotations
@@ -49,8 +48,8 @@ GAIN = {
 LEARNT = ('learnt/gain', 'learnt/loop')
 #: corrections published per second of the stream
 RATE = 50.0
-#: most change of the band of unknown plays within a block that the model learns from, as a share
-#: of the span: while plays become known, they explain the remaining error
+#: largest change of the band of unknown plays within a block from which the model learns, as a
+#: share of the span: plays that become known explain the remaining error
 SETTLED = 1e-5
 #: smallest creep from earlier motion that is mentioned, as a share of the span
 FAINT = 1e-4
@@ -183,7 +182,7 @@ class Corrector:
         return self._learning.learnt_model
 
     def restore(self) -> str:
-        """Return to the given model; the message says how much motion is forgotten."""
+        """Return to the model of `set_model`; the text gives the forgotten time."""
         adaptation = self._learning
         seconds = round(adaptation.seconds, 3)
         adaptation.restore()
@@ -214,13 +213,13 @@ class Corrector:
 
     @property
     def changed(self) -> str:
-        """What changed of the stage and is not corrected, as text; empty if nothing is clear."""
+        """Likely causes of the error that the corrections leave, as text; '' without any."""
         causes = self._attribution.causes if self._attribution is not None else []
         return ', '.join(str(cause) for cause in causes)
 
     @property
     def doubt(self) -> str:
-        """What the sensor does that the stage hardly does; empty if the sensor seems sound."""
+        """Doubt about the sensor, as text; '' if the sensor seems sound."""
         return self._observer.doubt if self._observer is not None else ''
 
     def _forget(self) -> None:
@@ -232,7 +231,7 @@ class Corrector:
         # whose displacement has come or is given up
         self._next, self._told, self._decided = 0, -1, -1
         self._last: Array | None = None
-        # what was felt of other axes, a horizon before the next sample
+        # motion by other axes, a horizon before the next sample
         self._felt = np.zeros(self._horizon)
         # see `Estimated.is_settled`
         self._is_settled = True
@@ -244,7 +243,7 @@ class Corrector:
         Take the prediction for the last samples of a block of voltage; return finished estimates.
 
         `known` says whether the run knew the outputs of the plays before the first block; `felt`
-        is the part of the prediction that other axes cause [m].
+        is the motion by other axes in the prediction [m].
         """
         if self._model is None:
             return []

@@ -4,14 +4,13 @@
 """
 Correct a wanted motion by the measured error of a running stage.
 
-A stage differs from its model by an offset, creep and a gain.  The follower subtracts them from
-the wanted motion before the inverse of the model makes the voltage.  Each of several axes has a
-follower of its motion by its own voltage.
+A stage differs from its model by an offset, creep and a gain.  The follower removes them from the
+wanted motion before the inverse of the model makes the voltage.  Each axis has a follower of its
+motion by its own voltage.
 
-Corrections change at knots, which lie at fixed ticks of the voltage.  A knot follows from what the
-observer knew `LATE` before the newest voltage, so neither the cuts of the streams nor the delay of
-the displacement make a difference, as long as both stay below `LATE`.  Displacement that comes
-later counts from the next knot on.
+Corrections change at knots, at fixed ticks of the voltage.  A knot uses the state of the observer
+`LATE` before the newest voltage.  Therefore the size of blocks and the delay of the displacement
+make no difference below `LATE`.  Later displacement counts from the next knot on.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from piezo_ident.record.blocks import Samples
 
 #: time between two knots [s]: a usual block
 KNOT = 5e-3
-#: age of what the observer knew: a block and the way to the stage and back, with reserve [s]
+#: age of the state of the observer: a block and the way to the stage and back, with reserve [s]
 LATE = 0.05
 #: time constant with which a wanted motion takes over a correction; a step would excite the modes
 #: of a stage [s] (taste)
@@ -40,7 +39,7 @@ MOST = 0.1
 
 
 class _Known(NamedTuple):
-    """What the observer knows before a tick: offset and creep by element [m], and gain."""
+    """State of the observer before a tick: offset and creep by element [m], and gain."""
 
     tick: int
     offset: float
@@ -56,7 +55,7 @@ class Follower:
     ----------
     model : StageModel
     gain : bool
-        Whether the gain is followed, too.
+        Whether the gain is corrected, too.
     step : float
         Largest change of the correction from one sample to the next [m].
     run : tuple of Stream and int, optional
@@ -102,7 +101,7 @@ class Follower:
         """
         Take the voltage [V] that was sent, at the times t [s]; at least one sample.
 
-        `moved` is the motion by this voltage, `felt` what the axis feels of others [m].
+        `moved` is the motion by this voltage, `felt` the motion by other axes [m].
         """
         y, ticks = moved + felt, self._next + np.arange(v.size)
         self._next += v.size
@@ -149,7 +148,7 @@ class Follower:
         return wanted + np.clip(change, -limit, limit)
 
     def _reach(self, knot: int, lead: int) -> None:
-        """Go on to a knot; without a wanted motion in between, the corrections stayed."""
+        """Go on to a knot; the corrections stay while no motion is wanted."""
         if knot == self._at:
             return
         self._at, tick = knot, knot * self._knot

@@ -4,7 +4,7 @@
 """
 Keep the voltage of an amplifier within its limits and its slew.
 
-A command may be out of range, jump, hold NaN, stop, or start over.  The guard answers:
+A command may leave the limits, jump, hold NaN, stop, or start over.  The guard answers:
 
 - it passes a correct command bit for bit;
 - it applies the limit for a command outside the limits, and follows a jump at the slew;
@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.kernel import kernel
 
-#: longest ramp to rest of a node that shuts down [s]
+#: longest ramp to rest at the end of a node [s]
 LAST_RAMP = 0.7
 #: reasons for altering a sample, in the order of the counts of the kernel
 REASONS = ('not_finite', 'outside_limits', 'too_fast', 'joining')
@@ -50,7 +50,7 @@ class GuardSettings:
     ramp_slew : float
         Top speed of the ramps to rest and into a new stream [V/s].
     rest : float
-        Voltage of a drive without a command [V].
+        Voltage without a command [V].
     sample_rate : float
         [Hz]
 
@@ -163,7 +163,7 @@ def _follow(
 
 class Guard:
     """
-    Turns a command into a safe voltage; the size of the blocks changes no bit of it.
+    Turns a command into a safe voltage, which does not depend on the size of the blocks.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class Guard:
         # NaN before the first command repeats the start voltage
         self._state = np.array([start, start, 0.0, 0.0, 0.0, 1.0])
         self._settings = settings
-        # start [V] and length of the ramp to rest, and samples of it that are done
+        # start [V], length and number of finished samples of the ramp to rest
         self._ramp: tuple[float, int, int] | None = None
         # whether nothing has been commanded since the last silence
         self._idled = False

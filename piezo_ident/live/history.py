@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Keep as much of a voltage as the state of any new model depends on.
+Keep the part of a voltage on which the state of a new model depends.
 
 A new model takes over in the state that it would have if it had run from the start.  Its plays
 remember extremes of the voltage since the start of the run.  A loop inside a later stroke leaves
-no trace in them (the wiping-out property), so only a few turning points matter.  The history keeps
+no trace in the plays (the wiping-out property), so few turning points matter.  The history keeps
 these turning points, the samples just before each, and the last seconds in full.
 """
 
@@ -24,9 +24,9 @@ from piezo_ident.record.blocks import Samples
 
 #: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
-#: time before each turning point in which samples are kept [s]
+#: length of the kept samples before each turning point [s]
 APPROACH = 0.05
-#: most blocks that are kept in full
+#: most blocks of the last seconds
 MOST_BLOCKS = 100_000
 
 
@@ -104,7 +104,7 @@ class TurningPoints:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Start, turning points and last sample [V]."""
+        """Voltage at the start, at the turning points and at the last sample [V]."""
         return np.array([x for x, _ in self._points])
 
     def path(self, period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -190,7 +190,7 @@ class History:
         return t, v
 
     def since(self, count: int) -> NDArray[np.float64]:
-        """Return the voltage after the first `count` samples [V], as far as it is kept in full."""
+        """Return the voltage after the first `count` samples [V], at most the last seconds."""
         missing, parts = self.count - count, [np.empty(0)]
         for _, v in reversed(self._recent):
             if missing <= 0:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Join the streams of several axes: blocks of the first axis wait for the others of their time."""
+"""Join the streams of several axes: a block of the first axis waits for the other axes."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ HEARD = 1.0
 
 def held(x: Array, before: float) -> Array:
     """
-    Replace each NaN or infinite sample by the sample before it.
+    Replace each NaN or infinite sample by the last finite sample.
 
-    Without a sample before, which is NaN then, the first finite sample of the block replaces it.
+    `before` is the sample before the block; NaN stands for the first finite sample of the block.
 
     >>> held(np.array([np.nan, 1.0, np.inf]), 3.0).tolist()
     [3.0, 1.0, 1.0]
@@ -45,7 +45,7 @@ def held(x: Array, before: float) -> Array:
 
 class Companion:
     """
-    Samples of one topic by their tick.
+    Samples of one topic, by tick.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Companion:
         return all(tick in self._kept for tick in self._ticks(t))
 
     def take(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Remove and return the samples at the given times; NaN stands for a missing sample."""
+        """Remove and return the samples at times t [s]; NaN stands for a missing sample."""
         return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
 
     def _ticks(self, t: NDArray[np.float64]) -> list[int]:
@@ -100,7 +100,7 @@ class Join:
     tails : sequence of str
         Ends of the topics of the further axes, such as ``_b``.
     sample_rate : float, optional
-        Rate of the clock of the stream, or one that is finer [Hz].
+        Rate of the clock of the stream, or a higher rate [Hz].
     rest : sequence of float, optional
         Values of the further axes before their first sample.  Default: zero.
 
@@ -125,7 +125,7 @@ class Join:
         self._companions = {tail: Companion(sample_rate) for tail in tails}
         self._last = {**dict.fromkeys(tails, 0.0), **dict(zip(tails, rest, strict=False))}
         self._heard = dict.fromkeys(tails, -math.inf)
-        # blocks with a note of the caller, and their arrival
+        # blocks, each with a note of the caller and its arrival
         self._waiting: deque[tuple[Samples, Any, float]] = deque()
 
     def add(self, tail: str, samples: Samples, since: float, note: Any = None) -> None:
@@ -142,8 +142,8 @@ class Join:
         """
         Yield the blocks of the first axis whose partners have come, with note and silent axes.
 
-        `is_over` says whether the wait of a block that came at a time [s] is over.  No block waits
-        for a `silent` axis, whose topic no node publishes, unless it was heard lately.
+        `is_over` says whether a block that came at a time [s] has waited long enough.  No block
+        waits for a `silent` axis, whose topic no node publishes, unless it was heard lately.
         """
         while self._waiting:
             samples, note, since = self._waiting[0]
@@ -163,10 +163,10 @@ class Join:
 
     def rows(self, samples: Samples) -> tuple[Samples, dict[str, int]]:
         """
-        Add the further axes to a block, a row for each axis; without any the block stays as it is.
+        Add a row for each further axis to a block; without further axes return the block.
 
-        The last sample of an axis stands for its missing samples.
-        The mapping counts the missing samples of each axis that has some.
+        The last sample of an axis replaces its missing samples.  The mapping counts the missing
+        samples by axis.
         """
         rows, missing = [samples.values], {}
         for tail in self._companions:

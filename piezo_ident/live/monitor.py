@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Join measured and predicted blocks on time, bin them for display, and compare them by rms."""
+"""Join measured and predicted blocks on time, bin signals for display, and take live errors."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from piezo_ident.record.readings.jumps import AROUND, least_step, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
-#: time of waiting blocks without a match, after which both streams count as in one run [s]
+#: length of waiting blocks beyond which both streams count as one run of the clock [s]
 CATCH_UP = 1.0
 #: largest number of waiting blocks
 MOST = 500
 #: number of bins by which a late quantity may hold up the others
 LAG = 25
-#: samples on either side that decide whether a reading is wild
+#: samples on either side that a judgement of a reading needs
 EDGE = AROUND + 4
 
 
@@ -45,7 +45,7 @@ class Matched:
 
 
 class _Side:
-    """One of two streams: its clock, its waiting blocks, and the run of the clock it is in."""
+    """One of two streams: its clock, its waiting blocks, and the number of the clock's run."""
 
     def __init__(self) -> None:
         self.clock = BlockClock()
@@ -69,8 +69,8 @@ class Matcher:
     """
     Joins two streams of blocks on time, in any order and with blocks of any size.
 
-    After a restart of the clock the times of the old run repeat, so a block waits until the other
-    stream has restarted too.
+    A restarted clock repeats the times of the old run, so a block waits until the other stream has
+    restarted, too.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Matcher:
 
     @property
     def late(self) -> int:
-        """Measured samples that came again or out of turn."""
+        """Number of measured samples that came again or out of turn."""
         return self._measured.clock.late
 
     @property
@@ -109,7 +109,7 @@ class Matcher:
         if kind is Kind.START:
             own.waiting.clear()
             if not own.clock.restarts or other.run > own.run:
-                # the other stream has started or restarted before; this one catches up
+                # the other stream has started or restarted before
                 own.run = other.run
             else:
                 own.run += 1
@@ -155,7 +155,7 @@ class PreviewBin:
 
 
 class Preview:
-    """Bins of sample time, `rate` per second; a bin is complete once all quantities passed it."""
+    """Bins of sample time, `rate` a second; a bin is complete when all quantities are past it."""
 
     def __init__(self, rate: float = 50.0) -> None:
         self.rate = rate
@@ -214,7 +214,7 @@ class TrackingError:
     """
     Wanted minus measured displacement, block by block.
 
-    `live` takes the rms over a time `window` [s]; `quantity` is the name of the errors.
+    `live` has the rms over a time `window` [s]; `quantity` is the name of the errors.
     """
 
     def __init__(self, window: float, quantity: str = 'tracking_error') -> None:
@@ -272,7 +272,7 @@ class LiveError:
         self._forget_last()
 
     def _forget_last(self) -> None:
-        # the newest errors and measured displacements, and how many of them are judged
+        # the newest errors and measured displacements; the number of judged ones
         self._last, self._judged = np.empty((2, 0)), 0
 
     def add(
@@ -302,7 +302,7 @@ class LiveError:
             self._parts.popleft()
 
     def _sorted(self, new: Array, stroke: float) -> tuple[Array, Array]:
-        """Sum kept and wild readings of all samples that have enough neighbours to be judged."""
+        """Sum kept and wild readings of the samples with enough neighbours for a judgement."""
         e, y = new
         wild = np.zeros(e.size, dtype=bool)
         if np.isfinite(stroke):
@@ -330,7 +330,7 @@ class LiveError:
 
     @property
     def outliers(self) -> int:
-        """Samples of the window that are left out."""
+        """Number of wild readings of the window."""
         return self._sums()[1]
 
     @property

@@ -1,16 +1,16 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Time the sending and the arrival of blocks, even if somebody sets the clock of the machine."""
+"""Time the sending and the arrival of blocks, independent of changes of the machine's clock."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import time
 
-#: delay of a block that is not made up: readers keep only so many blocks [s]
+#: larger delays are not made up, since readers keep so many blocks [s]
 SLIP = 0.25
-#: smallest jump of the clock that means that it was set; less than the time of a block [ns]
+#: smallest jump of a clock that was set; less than the time of a block [ns]
 STEP = 500_000
 
 
@@ -73,7 +73,7 @@ class Pace:
     """
     Counts the samples due in real time since the last look.
 
-    The stream has `rate` samples a second.  A look makes up for the `longest` time [s] at most:
+    The stream has `rate` samples a second.  A look makes up for at most the time `longest` [s]:
     after a long pause of the process the stream goes on where it was.
     """
 
@@ -92,8 +92,8 @@ class Looks:
     """
     Time-outs of a process that looks regularly for messages.
 
-    A busy machine may stop the process for a while; messages sent meanwhile wait unread.  A wait
-    is therefore over only if the look before the last also came after more than half of the limit.
+    A busy machine may stop the process, and messages sent meanwhile wait unread.  A wait is
+    therefore over only if the look before the last one, too, came after half of the limit.
     """
 
     def __init__(self) -> None:
@@ -113,9 +113,8 @@ class ArrivalClock:
     Times of arrival that go on evenly when somebody sets the clock of the machine.
 
     A bag is read in the order of its log times.  Times from a clock that was set back would
-    interleave later messages with earlier messages.  `wall` stamps arrivals and may be set,
-    `steady` cannot be set [ns].  `set_by` is the time by which the clock was set since the
-    beginning [ns].
+    interleave later messages with earlier messages.  The clock `wall` [ns] stamps arrivals and may
+    be set; the clock `steady` [ns] cannot be set.  `set_by` is the total change of `wall` [ns].
     """
 
     def __init__(

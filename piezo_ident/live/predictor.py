@@ -4,7 +4,7 @@
 """
 Predict the displacement of a running stage, through gaps, restarts and new models.
 
-`AxesRun` runs chains and `ModesRun` shared modes; `Predictor` meets what a stream may bring.
+`AxesRun` runs chains and `ModesRun` shared modes; `Predictor` handles the faults of a stream.
 `piezo_ident.live.history` brings a new model into the state that it would have if it had run from
 the start.
 """
@@ -41,7 +41,7 @@ from piezo_ident.uncertainty.band import band_of, BandStream, KEY
 BRIDGE = 0.5
 #: share of the voltage range that counts as its lower end; a stage there has a known memory
 REST = 0.01
-#: share of the errors that a band holds unless another one is asked for (taste)
+#: default share of the errors that a band holds (taste)
 LEVEL = 0.9
 
 
@@ -49,8 +49,8 @@ class AxesRun:
     """
     Run of a model, with a row of voltages and of displacements for each axis.
 
-    A coupled axis runs twice: alone, which gives the motion that other axes feel, and with the
-    motions of the others.
+    A coupled axis runs twice: alone, for the motion by its own voltage, and with the motions of
+    the other axes.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class AxesRun:
     Attributes
     ----------
     felt : ndarray, shape (k, n)
-        Part of the last displacements that is felt of the other axes [m].
+        Motion by other axes in the last displacements [m].
 
     Examples
     --------
@@ -83,7 +83,7 @@ class AxesRun:
         self.felt = np.zeros((len(axes), 0))
 
     def recall(self, pasts: Sequence[History], period: float) -> None:
-        """Come into the state after the voltages so far; `pasts` has one history a row."""
+        """Take the state after the past voltages; `pasts` has a history for each row."""
         t, rows = np.empty(0), []
         for axis, past in zip(self._alone, pasts, strict=True):
             for run in filter(None, (self._coupled.get(axis), self._alone[axis])):
@@ -114,7 +114,7 @@ def run_of(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> AxesRun |
 
 
 def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
-    """Refuse a model of other axes than those of a node with a ModelError."""
+    """Raise ModelError for a model of other axes than those of a node."""
     held = models_of(model)
     if set(held) != set(axes):
         raise ModelError(
@@ -141,7 +141,7 @@ class Predictor:
     half_width : Samples or None
         Half width of the band of the last block [m]; None if the model carries no band.
     felt : ndarray, shape (k, n)
-        Part of the last prediction that each axis feels of the others [m].
+        Motion by other axes in the last prediction [m].
     """
 
     def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:
@@ -162,12 +162,12 @@ class Predictor:
 
     @property
     def lost(self) -> int:
-        """Samples that are missing or not usable."""
+        """Number of missing or unusable samples."""
         return self._clock.lost
 
     @property
     def late(self) -> int:
-        """Samples that came again or out of turn, and were left out."""
+        """Number of samples that were left out as repeated or late."""
         return self._clock.late
 
     @property
@@ -203,8 +203,8 @@ class Predictor:
         """
         Take a model, in the state that it would have if it had run from the start.
 
-        ModelError when its axes or its sampling rate are not those of the stream, or when one of
-        its effects needs a further channel.
+        ModelError for other axes or another sampling rate than those of the stream, and for an
+        effect that needs a further channel.
         """
         check_axes(model, self._axes)
         require_voltages_only(model)
@@ -242,8 +242,7 @@ class Predictor:
         """
         Predict the displacement [m] for a block of voltage [V], shape (n,), or (k, n) for k axes.
 
-        The result is None if the block is left out, or if the model is missing or has another
-        rate.
+        The result is None if the block is left out, or without a model of the rate of the stream.
 
         A straight line bridges a gap of up to half a second.  A longer gap and a restart begin a
         new run, with the stage at rest.  Repeated and late blocks, and blocks with NaN or infinite

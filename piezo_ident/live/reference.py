@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The reference of a stage as it comes, joined over the axes, and how far the stage is from it."""
+"""The reference of a stage, joined over its axes, and the errors of the stage."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Reference:
     """
     Reference of all axes, as one stream.
 
-    `tails` are the ends of the topics of all axes, the first one empty.  `join` holds the blocks
-    that wait, and `length` is the number of samples of the last stream.
+    `tails` are the suffixes of the topics of all axes, the first one empty.  `join` holds the
+    waiting blocks, and `length` is the number of samples of the last stream.
     """
 
     def __init__(self, tails: Sequence[str], sample_rate: float) -> None:
@@ -32,7 +32,7 @@ class Reference:
         self.reset()
 
     def reset(self, rest: Sequence[float] = ()) -> None:
-        """Begin at `rest`, the displacements of the further axes [m]; the last stream stays."""
+        """Begin at `rest`, the displacements of the further axes [m]; keep the last stream."""
         self.join = Join(self._tails[1:], self._rate, rest)
         # labels, each with its first sample
         self._labels: deque[tuple[int, str]] = deque()
@@ -43,10 +43,10 @@ class Reference:
         self, samples: Samples, verdict: Verdict, resting: Collection[str], longest: float
     ) -> tuple[Array, list[tuple[str, str, int]]]:
         """
-        Make the next block whole; return it with its faults.
+        Complete the next block of the first axis; return it with its faults.
 
-        The `verdict` is that of the clock on this block, which is one of the first axis.  Nobody
-        wants to move the `resting` axes.  The stream is kept up to the length `longest` [s].
+        The `verdict` is the clock's verdict on this block.  The `resting` axes have no reference.
+        The stream is kept up to the length `longest` [s].
 
         Returns
         -------
@@ -102,8 +102,8 @@ class TrackingErrors:
     """
     Wanted minus measured displacement of each axis.
 
-    `tails` are the ends of the topics of all axes.  The rms is taken over a time `window` [s].
-    `percents` holds the rms of each axis at the last `look` [% of the span of the wanted motion].
+    `tails` are the suffixes of the topics of all axes.  The rms is taken over a time `window` [s].
+    `percents` has the rms of each axis at the last `look` [% of the span of the wanted motion].
     """
 
     def __init__(self, tails: Sequence[str], window: float) -> None:
@@ -133,12 +133,12 @@ class TrackingErrors:
         return self._each[tail].measured(samples)
 
     def is_waiting(self, tail: str) -> bool:
-        """Tell whether wanted motion of an axis still waits for its displacement."""
+        """Return whether wanted motion of an axis waits for its displacement."""
         return self._each[tail].is_waiting
 
     @property
     def outliers(self) -> int:
-        """Readings that the errors leave out."""
+        """Number of readings that the errors leave out."""
         return sum(one.live.outliers for one in self._each.values())
 
     def look(self) -> None:
@@ -148,8 +148,8 @@ class TrackingErrors:
 
     def figures(self) -> dict[str, str]:
         """List the errors of the last `look`, for /diagnostics."""
-        found = {}
+        figures = {}
         for tail, percent in self.percents.items():
-            found[f'tracking_rms{tail}'] = f'{self._each[tail].live.rms:.6g}'
-            found[f'tracking_percent{tail}'] = f'{percent:.4g}'
-        return found
+            figures[f'tracking_rms{tail}'] = f'{self._each[tail].live.rms:.6g}'
+            figures[f'tracking_percent{tail}'] = f'{percent:.4g}'
+        return figures

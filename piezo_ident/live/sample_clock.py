@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Follow one stream of blocks by its time stamps, and by its publisher where that matters.
+Follow a stream of blocks by its time stamps, and by its publisher.
 
 `BlockClock` follows a stream of any rate, from any publisher.  `SampleClock` follows a stream of a
 known rate, from one publisher.
 
 A node that drives an amplifier must know how a block relates to its stream.  The block may go on
 where the last block ended, start over, come twice or too late, or belong to another publisher.
-Some middleware does not say which publisher sent a message.  rclpy gives the number that the
-publisher counted for the message, and the ids of all publishers of the topic.  The rules are:
+rclpy does not say which publisher sent a message.  It gives the number that the publisher counted
+for the message, and the ids of all publishers of the topic.  The rules are:
 
 - Every message belongs to the followed publisher while the topic has no other publisher.
 - Beside other publishers a message belongs to the followed publisher if it carries the next
@@ -42,7 +42,7 @@ Publishers = Callable[[], Collection[Hashable]]
 MEMORY = 8
 #: largest distance of a time stamp from its tick [samples]
 SLACK = 1e-3
-#: a clock that jumps ahead by more is another clock: a day, the longest capture [s]
+#: a clock that jumps ahead by more has restarted: a day, the longest capture [s]
 LONGEST_GAP = 86_400.0
 
 
@@ -148,9 +148,8 @@ class SampleClock:
         sequence : int, optional
             Number that its publisher gave the message; None if the middleware does not tell.
         publishers : callable, optional
-            Returns the ids (gids) of all publishers of the topic.  It is called only if a block
-            does not simply go on, or if others were present at the start.  No ids mean one
-            publisher.
+            Returns the ids (gids) of all publishers of the topic; no ids mean one publisher.
+            Called only if a block does not go on, or if others were present at the start.
         """
         ticks, reason = self._ticks(samples.t)
         if reason:
@@ -196,7 +195,7 @@ class SampleClock:
             )
         return t, f'its time stamps are not ticks of {self.sample_rate:g} Hz in a row'
 
-    # whose it is
+    # publisher of a block
 
     def _is_next(self, sequence: int) -> bool:
         """Return whether a number is next for the followed publisher and for no other."""
@@ -206,7 +205,7 @@ class SampleClock:
 
     def _note_other(self, sequence: int | None) -> None:
         if sequence is not None:
-            # a number that either may have sent remains among the numbers of the other
+            # a number that both may have sent stays in the list of the others
             if sequence in self._others and sequence - 1 != self._sequence:
                 self._others.remove(sequence)
             self._others.append(sequence + 1)
@@ -277,7 +276,7 @@ class SampleClock:
 
 class BlockClock:
     """
-    Clock of a stream; it says if a block goes on, skips samples, came before, or starts over.
+    Clock of a stream: tells whether a block goes on, skips samples, came before, or starts over.
 
     Attributes
     ----------
