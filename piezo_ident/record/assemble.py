@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Raw columns to a record: every fault of measured data is met here, the same way for all formats.
+Make a record of raw columns, and handle every fault of measured data the same way for all formats.
 
 Gaps, restarts and changes of the sampling rate split the record.  Repeated rows are dropped.
-Samples without a number are cut out; the voltage of a sample stays if only the displacement is no
-number.  A `Fault` reports each of these.  Data that need a guess are refused, and the message says
-what to do.
+Samples without a number are cut out; the voltage stays if only the displacement is no number.  A
+`Fault` reports each of these faults.  Data that need a guess are refused with the remedy.
 """
 
 from __future__ import annotations
@@ -29,25 +28,25 @@ from piezo_ident.record.record import Fault, Piece, Record, Segment
 #: label of each stretch, and the row at which it begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
 
-#: higher rates [Hz] are counted in another unit than seconds
+#: highest rate of times in seconds [Hz]
 MAX_RATE = 1e9
-#: pieces of a record at most
+#: most pieces of a record
 PIECES = 10_000
-#: more pieces than this, with fewer samples than this in each, are no uniform sampling
+#: more pieces than this, with fewer samples than this on average, are no uniform sampling
 MANY = 10
-#: a piece of fewer samples may tell a rate of its own; more such rates come from no clock
+#: least samples of a piece that shows the rate of a clock, and most rates of shorter pieces
 FEW, MOST_RATES = 32, 3
 #: strokes of piezo stages [m]; anything else is the wrong unit
 STROKE = (1e-9, 10e-3)
-#: spans of a voltage [V]; the squares of others leave what a float64 can hold
+#: spans of a voltage [V]; squares of other spans leave the range of a float64
 VOLTAGE = (1e-12, 1e12)
 #: share of a motion that a float64 may lose to an offset
 LOST = 1e-6
-#: share of samples without a number that can be cut out
+#: largest share of samples without a number that are cut out
 MAX_NOT_FINITE = 0.01
-#: the same of displacements beside a voltage, in places that are no more than the above
+#: largest share of displacements without a number, in at most `MAX_NOT_FINITE` n places
 MAX_NOT_MEASURED = 0.3
-#: later times [s] are counted in another unit than seconds
+#: latest time in seconds [s]
 MAX_TIME = 1e11
 
 
@@ -83,10 +82,10 @@ def assemble(
 
     `v` or `y` become NaN if they are None.  `segments` are the label of each stretch and the row
     at which it begins; an empty label means none.  `channels` are further signals, ``v_<name>``
-    and ``y_<name>`` those of another axis.  The unit of `y` and the limits of `v` in the `options`
-    hold for further axes too.  The stamps must agree with the `sample_rate` [Hz] that a file
-    names.  The record takes over `faults` that the caller met.  DataError for data that cannot be
-    used without a guess.
+    and ``y_<name>`` the signals of another axis.  The unit of `y` and the limits of `v` in the
+    `options` hold for all axes.  The stamps must agree with the `sample_rate` [Hz] that a file
+    names.  The record takes over the `faults` of the caller.  DataError for data that need a
+    guess.
     """
     options = options or ReadOptions()
     met = list(faults)
@@ -247,7 +246,7 @@ def _pieces(
     resolution = Resolution.of(t)
     parts: list[tuple[int, int]] = []
     for begin, end in zip(epochs, [*epochs[1:], t.size], strict=True):
-        # uniform across a lost sample or not, the record is cut there
+        # a row that lost its predecessor begins a piece, also on uniform stamps
         torn = table.torn[(table.torn > begin) & (table.torn < end)]
         starts = [begin + start for start, _ in split_uniform(t[begin:end], resolution)]
         marks = np.union1d(starts, torn).astype(np.int64)

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Samples as they travel: blocks of (t, value) rows in a Float64MultiArray, and nothing of ROS.
+Blocks of samples: (t, value) rows as in a Float64MultiArray, without ROS.
 
 A block is an N x 2 matrix, row by row::
 
     dim[0] = {label 'sample:<segment>', size N, stride 2N}
     dim[1] = {label 't,<quantity>',     size 2, stride 2}
 
-A block thus explains itself: the times, quantity and segment of its samples.  The quantity is
-``voltage``, ``displacement``, ``voltage_<name>`` or ``displacement_<name>`` for a further axis, or
-``x_<name>`` for a further channel.
+A block thus names the segment and the quantity of its samples.  The quantity is ``voltage``,
+``displacement``, ``voltage_<name>`` or ``displacement_<name>`` for a further axis, or ``x_<name>``
+for a further channel.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROUNDING = 1e-5
 #: shortest sampling period of a block [s]: 10 MHz is the highest rate of a node; largest time [s]:
 #: 300 years, where a double still resolves 2 us
 SHORTEST, LATEST = 1e-7, 1e10
-#: a longest step of so many shortest ones means a missing sample, not jitter (taste)
+#: ratio of longest to shortest step that means a missing sample, not jitter (taste)
 UNEVEN = 1.5
 
 
@@ -92,9 +92,9 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
     """
     Return the samples of a block, from the numbers of its message, shape (2 n,), and their layout.
 
-    The numbers are not copied; `data_offset` of them stand in front of the matrix.  Ticks of a
-    whole rate become k / rate, so that streams meet on them: k times the period is another number.
-    DataError for another layout than that of a block, or for a layout that does not fit the data.
+    The numbers are not copied; `data_offset` numbers stand in front of the matrix.  Times on ticks
+    of a whole rate become k / rate, so that streams meet on equal numbers.  DataError for another
+    layout than that of a block, or for a layout that does not fit the data.
     """
     flat = np.asarray(data, dtype=np.float64)
     quantity = quantity_of(dims)
@@ -120,7 +120,7 @@ def decode(data: ArrayLike, dims: Sequence[Any], data_offset: int = 0) -> Sample
 @np.errstate(over='ignore', invalid='ignore')
 def time_problem(t: Array) -> str:
     """
-    Return the reason why time stamps [s] are no samples in a row, empty if they are.
+    Return why time stamps [s] are not consecutive samples; empty if they are.
 
     >>> time_problem(np.array([0.0, 0.1, 0.2])), time_problem(np.array([0.0, np.nan]))
     ('', 'its time stamps are not finite, or more than 1e+10 s from zero')
@@ -140,10 +140,10 @@ def time_problem(t: Array) -> str:
 
 @np.errstate(over='ignore', invalid='ignore')
 def _on_ticks(t: Array) -> Array:
-    """Return times that are ticks but for rounding as ticks over their rate."""
+    """Replace times that are rounded ticks by ticks over their rate."""
     span = float(t[-1] - t[0]) if t.size > 1 else 0.0
     rate = (t.size - 1) / span if 0.0 < span < np.inf else 0.0
-    # times that are no numbers, or jump, are met elsewhere
+    # `time_problem` judges times that are no numbers, or jump
     if not 1.0 <= rate < 1e9 or abs(rate / round(rate) - 1.0) > ROUNDING:
         return t
     exact: Array = np.rint(t * round(rate)) / round(rate)

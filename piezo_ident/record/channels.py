@@ -4,8 +4,8 @@
 """
 Channels of a stage with several axes, and their names in each format.
 
-The first axis is ``v`` and ``y``, as of any stage.  Voltage and displacement of another axis are
-the channels ``v_<name>`` and ``y_<name>``.  Code for one axis takes them for further channels.
+The first axis is ``v`` and ``y``.  Voltage and displacement of another axis are the channels
+``v_<name>`` and ``y_<name>``, which code for one axis treats as further signals.
 
 | channel | column of a table | topic, and quantity of its blocks |
 |---|---|---|
@@ -33,7 +33,7 @@ _AXIS = re.compile(r'([vy])_(\w{1,60})', re.ASCII)
 
 def role_of(channel: str) -> str:
     """
-    Return ``v`` or ``y`` for a channel of another axis, else nothing; no unit names an axis.
+    Return ``v`` or ``y`` for a channel of another axis, else ''; a unit names no axis.
 
     >>> [role_of(x) for x in ('v_b', 'y_tilt', 'temperature', 'y_um', 'v')]
     ['v', 'y', '', '', '']
@@ -45,7 +45,7 @@ def role_of(channel: str) -> str:
 
 
 def column_of(channel: str) -> str:
-    """Return the name of a channel's column."""
+    """Return the column of a channel."""
     return channel if role_of(channel) else f'x_{channel}'
 
 

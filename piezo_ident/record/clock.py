@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The sampling clock behind a column of time stamps.
+Find the sampling clock of a column of time stamps.
 
 Stamps are rounded: to the decimals or digits that a file prints, to single precision, or to the
 last bit.  A stamp is therefore an interval.  A stretch of stamps is uniform if one rate passes
 through all its intervals.  The rate with the fewest digits is taken: a sampling clock is 5000 Hz,
-not 4999.9999999997 Hz, and the choice stays the same when the record is written and read again.
+not 4999.9999999997 Hz, and a written record reads the same.
 
-A computer that stamps samples as they arrive is late by a little here and there.  Steps between
-neighbours then look like gaps and changes of rate, but the next step takes each of them back: the
-stamps scatter about one clock.  A lost sample is not taken back.
+A computer that stamps samples as they arrive is sometimes late.  A late stamp makes a long step,
+which looks like a gap, and then a short step: the stamps scatter about one clock.  No short step
+follows a lost sample.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from piezo_ident.common.arrays import Array, CHUNK, Integers, Mask, true_runs
 JUMP_BACK = 1000
 #: fewer steps than this between two finer runs are gaps, not a slower sampling rate
 _SHORT = 8
-#: deviation from the uniform grid, in samples, that is not worth a notice
+#: negligible deviation from the uniform grid [samples]
 _NEGLIGIBLE = 0.01
-#: fewer stamps cannot tell scatter from a change of rate
+#: least stamps that distinguish scatter from a change of rate
 _LEAST = 16
-#: steps on either side over which time is averaged, so that scatter goes and a lost sample stays
+#: steps on either side of an average of time, which removes scatter and keeps a lost sample
 _AROUND = 8
 
 
@@ -47,7 +47,7 @@ class Clock(NamedTuple):
 
 @dataclass(frozen=True)
 class Resolution:
-    """How finely a column of stamps was printed: None means as finely as a float64 can."""
+    """Rounding of a column of stamps; None means the resolution of a float64."""
 
     decimals: int | None = None
     digits: int | None = None
@@ -55,7 +55,7 @@ class Resolution:
 
     @classmethod
     def of(cls, t: Array) -> Resolution:
-        """Return the coarsest rounding that all stamps obey."""
+        """Return the coarsest rounding that all stamps have."""
         # whole stretches, because every fifth stamp of 5 kHz has a decimal fewer than the rest
         blocks = np.linspace(0, max(t.size - 500, 0), 8).astype(int)
         x = np.abs(t if t.size <= 4000 else np.concatenate([t[b : b + 500] for b in blocks]))
@@ -119,7 +119,7 @@ def split_uniform(t: Array, resolution: Resolution) -> list[tuple[int, int]]:
     cuts = _without_scatter(t, np.flatnonzero(_breaks(t)) + 1)
     todo = list(itertools.pairwise([0, *cuts.tolist(), t.size]))[::-1]
     if cuts.size > t.size // _SHORT + 10:
-        return todo[::-1]  # no closer look will find a uniform stretch here
+        return todo[::-1]  # too many cuts for any uniform stretch
     done: list[tuple[int, int]] = []
     while todo:
         start, stop = todo.pop()
@@ -162,12 +162,12 @@ def _breaks(t: Array) -> Mask:
 
 
 def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
-    """Return the cuts that a stretch without coarse breaks still needs; empty if uniform."""
+    """Return the cuts of a stretch without coarse breaks; empty for a uniform stretch."""
     n = t.size
     if n < 3:
         return []
     dt = (t[-1] - t[0]) / (n - 1)
-    # rounding to a few decimals can hide a missing sample from a look at neighbours only
+    # rounding to a few decimals can hide a missing sample between neighbours
     wide: list[int] = []
     for i, step in _steps(t, 1):
         wide += (np.flatnonzero(step > 1.5 * dt) + (i + 1)).tolist()
@@ -188,7 +188,7 @@ def _inner_cuts(t: Array, resolution: Resolution) -> list[int]:
         return []
     rms = float(np.std(residual))
     parts = sorted(float(np.std(_line_residual(part))) for part in (t[:k], t[k:]))
-    # behind a true cut one side at least is clean; jitter does not get smaller by cutting
+    # at a true cut at least one side is clean; a cut does not reduce jitter
     return [k] if parts[0] < 0.5 * rms and parts[1] < 1.1 * rms else []
 
 
@@ -204,8 +204,8 @@ def _scatters(t: Array) -> bool:
     """
     Return whether increasing stamps [s] scatter about one uniform clock.
 
-    Stamps scatter if a line is off by less than half a sample everywhere, neighbours stray on
-    their own, and time that jumps forward comes back.
+    Stamps scatter if a line errs by less than half a sample everywhere, errors of neighbours are
+    independent, and time that jumps forward comes back.
 
     >>> t = np.arange(100.0)
     >>> _scatters(t + 0.3 * np.sin(t**2)), _scatters(np.delete(t, 50))
@@ -223,7 +223,7 @@ def _scatters(t: Array) -> bool:
 
 
 def _without_scatter(t: Array, cuts: Integers) -> Integers:
-    """Return the cuts of increasing stamps [s] that are more than scatter."""
+    """Return the cuts of increasing stamps [s] that scatter does not explain."""
     if not cuts.size:
         return cuts
     marks = np.array([0, *_jumps(t), t.size], dtype=np.int64)
@@ -255,9 +255,9 @@ def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> 
     """
     Fit a uniform clock to increasing stamps [s], two at least, of one uniform stretch.
 
-    The rate is the allowed rate of fewest digits, at the resolution of the whole file.  Rates [Hz]
-    that are `known` come first, in their order, if the stamps allow them: a long stretch of a file
-    tells the rate better than a short one.
+    The rate is the possible rate of fewest digits, at the resolution of the whole file.  A `known`
+    rate [Hz] that the stamps allow goes before: a long stretch of a file shows the rate better
+    than a short stretch.
     """
     dt = float(t[-1] - t[0]) / (t.size - 1)
     low, high = rate_bounds(t, lambda x: resolution.error(x, dt))
@@ -284,7 +284,7 @@ def fit_clock(t: Array, resolution: Resolution, known: Iterable[float] = ()) -> 
 
 
 def _settled(clock: Clock, n: int) -> Clock:
-    """Return the clock that is read from its own stamps: a written file reads the same."""
+    """Return the clock that its own stamps show, so that a written file reads the same."""
     for _ in range(5):
         t = time_stamps(clock.sample_rate, clock.start_time, 0, n)
         resolution = Resolution.of(t)
@@ -333,7 +333,7 @@ def nice_rates(low: float, high: float) -> Iterator[float]:
 
 
 def _start(t0: float, rate: float, resolution: Resolution) -> float:
-    """Return the tick of the sample clock that a first stamp means, or the stamp itself."""
+    """Return the tick of the sample clock at a first stamp, or the stamp itself."""
     tick = round(t0 * rate) / rate
     slack = float(resolution.error(np.array([t0]), 1 / rate)[0])
     return tick if abs(tick - t0) <= slack else t0
@@ -348,10 +348,10 @@ def has_restarted(first: float, last: float, begin: float, period: float) -> boo
     """
     Return whether time that jumps back is a restart of the sample clock.
 
-    The clock has restarted if the new stretch starts at or before the start of the old one, or
+    The clock has restarted if the new stretch starts at or before the start of the old stretch, or
     more than `JUMP_BACK` samples before its end.  Otherwise the samples came again or out of turn.
-    The times [s] are those of the first sample of the new stretch, of the newest sample so far,
-    and of the first sample since the last restart; `period` is the sampling period [s].
+    `first` is the time of the first new sample, `last` of the newest sample before, `begin` of the
+    first sample since the last restart; `period` is the sampling period [s].
 
     >>> has_restarted(0.0, last=0.02, begin=0.0, period=5e-5)
     True

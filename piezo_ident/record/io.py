@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records on disk: the suffix names the format, and every format carries the same."""
+"""Read and write records; the suffix of a file names its format."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     Returns
     -------
     Record
-        In SI units; its `faults` name every fault of the data, and how it was met.
+        In SI units; its `faults` name every fault of the data, and its treatment.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
 
 
 def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterator[Fault]:
-    """Yield the quantities of which another unit is likelier than that of the header."""
+    """Yield a fault for each quantity that likely has another unit than the header says."""
     rates = [piece.sample_rate for piece in record]
     slow, fast = ('slow', min(rates)), ('fast', max(rates))
     for kind, rate in [slow] * (slow[1] <= SLOW) + [fast] * (fast[1] > FAST):
@@ -272,7 +272,7 @@ def _check_labels(record: Record, path: Path) -> None:
 
 
 def _losses(record: Record, rows: Record) -> tuple[str, ...]:
-    """Read the columns of the rows as a reader does; say where they differ from the record."""
+    """Read the rows as a reader of the file does; return their differences from the record."""
 
     def whole(parts: list[Array]) -> Array:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A record from streams of blocks, whether they come live or from a bag.
+Make a record of streams of blocks, live or from a bag.
 
-Voltage and displacement meet on equal time stamps.  Blocks may be lost, come twice, or start over
-with a restarted clock, and the streams need not be cut into the same blocks.  Equal time stamps of
-two streams are matched in turn; after a loss, the two stamps that arrived closest to each other
-belong together.
+Voltage and displacement are joined on equal time stamps.  Blocks may be lost, come twice, or start
+over with a restarted clock, and the streams may be cut into other blocks.  If several stamps are
+equal, the two stamps that arrived closest to each other belong together.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ Matches = list[tuple[int, int, int]]
 
 #: commanded and applied voltage may differ by this share of the range
 TOLERANCE = 1e-3
-#: share of a segment, or of a further channel, beyond which missing samples make it unusable
+#: largest share of missing samples of a usable segment or further channel
 MAX_MISSING = 0.05
-#: least share of the samples in common, from the latest start to the earliest end: clocks that
-#: differ meet by chance now and then
+#: least share of common samples, from the latest start to the earliest end: different clocks meet
+#: by chance
 MET = 0.1
-#: rows of a stream at most so far apart belong to the same run of the sample clock
+#: largest distance of rows of one run of the sample clock [rows]
 NEARBY = 300
 
 
@@ -56,10 +55,10 @@ def record_of_streams(
     """
     Make a record of streams of blocks, by quantity: ``voltage``, ``displacement`` and further.
 
-    Samples whose command and ``applied_voltage`` differ are cut out: the guard of the amplifier
-    was at work, and the stage did not get the command.  A further axis or channel that lacks more
-    than `MAX_MISSING` of the samples is left out.  The other arguments, and the errors, are those
-    of `piezo_ident.record.assemble.assemble`.
+    Samples whose ``applied_voltage`` differs from the command are cut out, since the stage did not
+    get the command.  A further axis or channel that lacks more than `MAX_MISSING` of the samples
+    is left out.  The other arguments, and the errors, are those of
+    `piezo_ident.record.assemble.assemble`.
     """
     n = min(streams['voltage'].n, streams['displacement'].n)
     sparse = {
@@ -97,7 +96,7 @@ def record_of_streams(
 
 
 class Joined(NamedTuple):
-    """Columns of equal length, names and starts of the segments, and the faults that were met."""
+    """Columns of equal length, names and starts of the segments, and the faults."""
 
     t: Array
     columns: dict[str, Array]
@@ -106,13 +105,13 @@ class Joined(NamedTuple):
 
 
 def _driven_alone(name: str, stream: BlockStream) -> Iterator[Fault]:
-    """Say where a driver moved the stage by itself while commands were on their way."""
+    """Yield a fault for the voltages that a driver applied without a command."""
     (labels, starts), t = stream.labels(), stream.times
     for label, action in (
         (HELD, 'the command did not come, the driver held its voltage'),
         (RAMPED, 'no command came for long, the driver ramped to rest'),
     ):
-        # a ramp behind the last command changes nothing; t starts over in the next stream
+        # a ramp after the last command changes nothing; the next stream begins with a lower t
         rows = [
             (a, b)
             for own, a, b in zip(labels[1:-1], starts[1:-1], starts[2:], strict=True)
@@ -124,7 +123,7 @@ def _driven_alone(name: str, stream: BlockStream) -> Iterator[Fault]:
 
 
 def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> Joined:
-    """Cut out the samples whose applied voltage is not the commanded one."""
+    """Cut out the samples whose applied voltage differs from the command."""
     columns = dict(joined.columns)
     v, applied, t = columns[key], columns.pop(applied_key(key)), joined.t
     joined = joined._replace(columns=columns)
@@ -181,7 +180,7 @@ def join(
             keep[end:i] = False
             end = i + n
     if beside and not in_step:
-        # a row that came again and is left out has no partner
+        # a repeated row that is left out has no partner
         kept = np.where(keep, t, np.nan)
         for name, s in beside.items():
             matches[name] = _matches(kept, lead.arrivals, times[name], s.arrivals)
@@ -204,7 +203,7 @@ def join(
             left = np.ones(stream.n, dtype=np.bool_)
             for i, j, n in matches[name]:
                 left[j : j + n] = ~keep[i : i + n]
-            # of streams in step, only rows that are left have a twin
+            # in streams in step, only rows without a partner have a twin
             rows = np.flatnonzero(left) if in_step else np.arange(left.size)
             if left.any():
                 faults += _left_over(name, times[name][rows], values[rows], left[rows])
@@ -215,7 +214,7 @@ def join(
 
 
 def _cut(x: Array, matches: Matches, keep: Mask, *, alone: bool = False) -> Array:
-    """Return the values of the rows that are kept; `alone`, NaN for rows the stream lacks."""
+    """Return the values of the kept rows; with `alone`, NaN for rows that the stream lacks."""
     if alone:
         column = np.full(keep.size, np.nan)
         for i, j, n in matches:
@@ -236,10 +235,10 @@ def _in_step(
     streams: Mapping[str, BlockStream], times: Mapping[str, Array]
 ) -> dict[str, Matches] | None:
     """
-    Return the rows that the streams share, run by run of the sample clock.
+    Return the rows that the streams share, by runs of the sample clock.
 
-    None unless all streams went through the same runs and nothing came twice.  Hours of samples
-    are then joined without a table of partners.
+    Return None unless all streams have the same runs and no repeated block.  Hours of samples are
+    then joined without a table of partners.
     """
     begins, came = {}, {}
     for name, t in times.items():
@@ -247,7 +246,7 @@ def _in_step(
             return None
         begins[name] = begin = [0, *(np.flatnonzero(t[1:] <= t[:-1]) + 1).tolist()]
         for a, b in itertools.pairwise(begin):
-            # in samples: a repeated block is no run of its own
+            # in samples: a repeated block is no run
             if not has_restarted(float(np.searchsorted(t[a:b], t[b])), b - a, 0.0, 1.0):
                 return None
         came[name] = streams[name].arrived(np.array(begin))
@@ -256,7 +255,7 @@ def _in_step(
     matches: dict[str, Matches] = {}
     for name, t in times.items():
         other = came[name]
-        # runs of one clock are told apart by their times of arrival
+        # times of arrival distinguish the runs of one clock
         if (
             one.size != other.size
             or (other[1:] <= one[:-1]).any()
@@ -309,7 +308,7 @@ def _matches(ta: Array, arrived_a: Integers, tb: Array, arrived_b: Integers) -> 
     t, arrived = np.concatenate([ta, tb]), np.concatenate([arrived_a, arrived_b])
     by = np.lexsort((arrived, t))
     nearest = _nearest(t[by], arrived[by], by >= ta.size)
-    # both must be nearest to each other: the twin of a lost row has its own partner
+    # partners are nearest to each other: the twin of a lost row has its own partner
     mutual = np.flatnonzero((nearest >= 0) & (nearest[nearest] == np.arange(by.size)))
     mutual = mutual[by[mutual] < ta.size]
     order = np.argsort(by[mutual])
@@ -336,7 +335,7 @@ def _nearest(t: Array, arrived: Integers, in_b: Mask) -> Integers:
 
 
 def _left_over(name: str, t: Array, x: Array, left: Mask) -> list[Fault]:
-    """Say what became of the samples of a stream that found no partner."""
+    """Return the faults of the samples of a stream that have no partner."""
     by = np.argsort(t, kind='stable')
     same_time = t[by][1:] == t[by][:-1]
     same_value = x[by][1:] == x[by][:-1]

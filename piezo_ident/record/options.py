@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How a record is read: units, columns and topics that a file does not name."""
+"""Options of reading: units, columns and topics that a file does not name."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 @dataclass(frozen=True)
 class ReadOptions:
     """
-    How records are read; each format uses the options that concern it.
+    Options of reading; each format uses its own.
 
     Parameters
     ----------
     displacement_unit : {'m', 'mm', 'um', 'nm'}, optional
         Unit of the displacement in the file; by default the unit of the header, else m.  A number
-        before the unit scales one of the file: ``'10um/V'`` for a sensor that writes volts, and
-        likewise ``'20V'`` for a monitor that shows a twentieth.  Under a header of mV, a number
-        still belongs to one volt.  A unit without a number must agree with the header.
+        before the unit is the value of a 1 in the file: ``'10um/V'`` for a sensor that writes
+        volts, ``'20V'`` for a monitor that shows a twentieth.  Under a header of mV, the number
+        is the value of one volt.  A unit without a number must agree with the header.
     voltage_limits : tuple of float, optional
         Smallest and largest voltage [V] that may occur.
     namespace, voltage_topic, displacement_topic : str, optional
@@ -116,13 +116,13 @@ class ReadOptions:
         return tuple(role for role, gone in zip('tvy', absent, strict=True) if not gone)
 
     def unit(self, role: str) -> str | None:
-        """Return the given unit of ``t``, ``v`` or ``y``."""
+        """Return the option for the unit of ``t``, ``v`` or ``y``."""
         return {'t': self.time_unit, 'v': self.voltage_unit, 'y': self.displacement_unit}[role]
 
 
 def plain_unit(text: str) -> str:
     """
-    Return a unit with the letters of `UNITS`: either micro sign becomes u.
+    Return a unit with the letters of `UNITS`; both micro signs become u.
 
     >>> [plain_unit(x) for x in ('\u00b5m', '\u03bcm', 'Volts', 'sec', 'MS', 'furlong')]
     ['um', 'um', 'V', 's', 'ms', 'furlong']
@@ -163,7 +163,7 @@ def split_unit(text: str) -> tuple[str, str, bool]:
 
 def unit_factor(role: str, unit: str) -> float:
     """
-    Return the number of a unit from `scaled_unit` in one of SI; 1 for an empty unit.
+    Return how many of a unit from `scaled_unit` make one SI unit; 1 for an empty unit.
 
     >>> unit_factor('y', '10um/V'), unit_factor('v', 'mV')
     (100000.0, 1000.0)
@@ -179,7 +179,7 @@ def name_and_unit(name: str) -> tuple[str, str]:
     >>> [name_and_unit(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive')]
     [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive', '')]
     """
-    # the own name of a field of a struct, or of a channel of a group
+    # the name of a field without its struct, or of a channel without its group
     name = re.sub(PATH, '', name.strip())
     found = _NAMED.fullmatch(name)
     if not found:

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Rows in the order of time: repeats go, restarts are found, disorder is refused.
+Bring rows into the order of time: drop repeats, mark restarts, refuse disorder.
 
-Time that jumps back is a restart between two stretches of ten samples or more.  The jump ends at
+Time that jumps back is a restart between two stretches of at least ten samples.  The jump ends at
 or before the first stamp of the first stretch, or goes back by more than a thousand samples (ten
 blocks).  Rows that repeat earlier rows are dropped, unless they start over from the beginning and
 go on for more than two blocks: a simulation without noise, run again.
 
-Time may be rounded more coarsely than its samples follow each other.  At 5 kHz, stamps in whole
-milliseconds come five at a time.  Stamps of a long record still bound the sampling rate closely.
-If only one rate of few digits is left, it is taken.
+Time may be rounded to more than the sampling period.  At 5 kHz, five stamps in whole milliseconds
+are equal.  Stamps of a long record still bound the sampling rate closely.  The rate of few digits
+within these bounds is taken if there is only one.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from piezo_ident.record.clock import (
 )
 from piezo_ident.record.record import Fault
 
-#: time may jump back in a record only between stretches of at least this many samples
+#: least samples of the stretches on both sides of a restart
 MIN_STRETCH = 10
-#: chance at most that a rate of so few digits lies within the bounds of rounded stamps
+#: largest chance that a rate of so few digits lies within the bounds of rounded stamps
 CHANCE = 0.1
-#: rows that start over and equal the old ones for longer than this are another run
+#: longer rows that start over and equal the old rows are another run [samples]
 MAX_REPEAT = 200
 
 
 @dataclass(frozen=True)
 class OrderedRows:
-    """Columns, the row where each label begins, and the rows that lost their predecessor."""
+    """Columns, the first row of each label, and the rows that lost their predecessor."""
 
     t: Array
     columns: dict[str, Array]
@@ -67,7 +67,7 @@ def in_order(table: OrderedRows, name: str, met: list[Fault]) -> tuple[OrderedRo
     The faults are added to `met`.  DataError if time is unsorted, or has two samples at once.
     """
     n = table.t.size
-    # first the rows right behind their twins: the loop below then only sees real jumps
+    # rows right behind their twins are dropped first, so that only real jumps are left
     twin = table.t[1:] == table.t[:-1]
     if twin.any():
         for x in table.columns.values():
@@ -102,7 +102,7 @@ def _stretches(
     Returns the rows that stay, None for all, the first row of each epoch, and times of repeats.
     """
     t = table.t
-    # as long as nothing is dropped, rows are their own numbers and need no table
+    # without a dropped row, rows are their own numbers and need no table
     rows: Integers | None = None
     known = t  # t[rows], so that a look-up copies nothing
     size, begin = 0, 0
@@ -164,7 +164,7 @@ def _mean_rate(t: Array) -> str:
 
 
 def at_times(times: Array) -> str:
-    """Return a text with three of some times [s] at most."""
+    """Return a text with at most three of the times [s]."""
     if not times.size:
         return 'at unknown times'
     text = 'at ' + ', '.join(f'{x:.6g}' for x in times[:3]) + ' s'
@@ -175,8 +175,8 @@ def unrounded(table: OrderedRows, met: list[Fault]) -> Array:
     """
     Return uniform time in place of stamps that are rounded too coarsely; other stamps stay.
 
-    The fault is added to `met`.  The stamps must all agree with one rate, and be rounded so that
-    steps of two sizes are common: repeated rows, lost samples and gaps are met elsewhere.
+    The fault is added to `met`.  All stamps must agree with one rate, and rounding must make steps
+    of two sizes common.  Other code handles repeated rows, lost samples and gaps.
     """
     t, n = table.t, table.t.size
     if n < 10 or not t[-1] > t[0] or not np.all(np.isfinite(t)):
@@ -196,7 +196,7 @@ def unrounded(table: OrderedRows, met: list[Fault]) -> Array:
     if not low <= high:
         return t
     rate = next(nice_rates(low, high))
-    # digits behind the first one, of the rate or of its period
+    # digits after the first digit, of the rate or of its period
     digits = next(
         (d for d in range(15) if any(float(f'{x:.{d}e}') == x for x in (rate, 1 / rate))), 15
     )

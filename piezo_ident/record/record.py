@@ -4,9 +4,9 @@
 """
 A record: measured voltage, displacement, time and named segments.
 
-A record is a list of uniformly sampled pieces.  A new piece begins wherever time jumps, the rate
-changes or a sample is unusable, because the stage's memory at its start is unknown.  If the
-displacement alone is unusable, the new piece keeps the voltage that was played meanwhile.
+A record is a list of uniformly sampled pieces.  A new piece begins where time jumps, the rate
+changes or a sample is unusable, because the memory of the stage is then unknown.  If the
+displacement alone is unusable, the new piece keeps the voltage of that time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from piezo_ident.common.errors import DataError, expect
 from piezo_ident.common.showable import Showable
 from piezo_ident.record.clock import time_stamps
 
-#: the segment kinds that the programs use; other labels are kept and treated as unlabelled
+#: kinds of segments in programs; samples with other labels count as unlabelled
 KINDS: tuple[str, ...] = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase')
 KINDS += ('multisine', 'ramp', 'idle')
 
@@ -50,7 +50,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong with the data, and what was done about it."""
+    """A fault of the data, and its treatment."""
 
     name: str
     where: str
@@ -59,7 +59,7 @@ class Fault:
 
     @property
     def is_note(self) -> bool:
-        """Whether nothing was wrong: the note names the columns that were read."""
+        """Whether this is a note on the columns that were read, and no fault."""
         return self.name == 'columns'
 
     def __str__(self) -> str:
@@ -85,7 +85,7 @@ class Piece:
     channels : mapping of str to array_like, shape (n,)
         Further measured signals, for example temperature or another axis's voltage.
     before : Piece, optional
-        The samples right before, whose displacement alone is unknown.
+        The samples right before this piece, whose displacement alone is unknown.
     sound : array_like of bool, shape (n,), optional
         False for a reading that was no displacement of the stage, and that a straight line
         replaces; see `piezo_ident.record.readings.faults.without_faults`.  None: not yet judged.
@@ -159,7 +159,7 @@ class Piece:
         return self.time(0, self.n)
 
     def time(self, start: int, stop: int) -> Array:
-        """Return the time of samples ``start`` to ``stop - 1`` [s], the numbers that `t` holds."""
+        """Return the time of samples ``start`` to ``stop - 1`` [s], as in `t`."""
         return time_stamps(self.sample_rate, self.start_time, start, min(stop, self.n))
 
     def find(self, kind: str) -> list[Segment]:
@@ -267,7 +267,7 @@ class Record(Showable):
         Returns
         -------
         Record
-            In SI units; its `faults` name every fault of the data, and how it was met.
+            In SI units; its `faults` name every fault of the data, and its treatment.
 
         Raises
         ------
@@ -341,7 +341,7 @@ class Record(Showable):
         return [p.cut(s.start, s.stop) for p in self for s in p.find(kind)]
 
     def first(self, n: int) -> Record:
-        """Return the first n samples, which a fault names; the same record if it is short."""
+        """Return the first n samples with a fault that says so; a shorter record as it is."""
         if self.n <= n:
             return self
         starts = itertools.accumulate((piece.n for piece in self), initial=0)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The blocks of one topic as they come, in buffers that a copy shares.
+Collect the blocks of one topic, in buffers that copies share.
 
 Samples of a long bag move to temporary files, and are read back as memory maps.  A record of an
 hour then needs no memory of its own, and is an ordinary array to the rest of the package.
@@ -38,7 +38,7 @@ class BlockStream:
         self.n = 0
         self._spooled = spooled
         self._files: list[BinaryIO] = []
-        # rows of (t, value): of many blocks each, and the newest blocks one by one
+        # rows of (t, value): chunks of many blocks, and the newest blocks one by one
         self._chunks: list[Array] = []
         self._newest: list[Array] = []
         self._rows = 0  # in the newest blocks
@@ -150,7 +150,7 @@ class BlockStream:
 
 class LossCount:
     """
-    Counts the messages that are lost of a topic, by their numbers.
+    Counts the lost messages of a topic, by their numbers.
 
     >>> losses = LossCount()
     >>> for number in (7, 8, 1, 9, 2, 5):
@@ -159,7 +159,7 @@ class LossCount:
     2
     """
 
-    #: a larger gap between numbers is another publisher that joined late
+    #: a larger gap between numbers means another publisher that joined late
     GAP = 1000
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class LossCount:
         self._last: list[int] = []
 
     def note(self, number: int, *, alone: bool = False) -> None:
-        """Take note of a number; `alone` if its publisher is the only one, and gave the last."""
+        """Note a number; `alone` if only one publisher exists, which gave the last number, too."""
         before = [n for n in self._last if n < number and (alone or number - n <= self.GAP)]
         if not before:
             self._last.append(number)
@@ -177,5 +177,5 @@ class LossCount:
         self._last[self._last.index(nearest)] = number
 
     def restart(self) -> None:
-        """Take the next number as a first one."""
+        """Take the next number as the first."""
         self._last.clear()

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records in rosbag2 folders, mcap or sqlite3, with or without ROS on the machine.
+Read records from rosbag2 folders and files, mcap or sqlite3, without ROS.
 
-Topics are found by the quantity of their blocks, so their names may be remapped.  Namespaces tell
-the stages of a bag apart.  A bag and a live capture of the same blocks become the same
-record.  If the recorder was killed, the bag is refused; with `ReadOptions.recover` its whole
-messages are read.
+The quantity of its blocks selects a topic, so names may be remapped.  Namespaces distinguish the
+stages of a bag.  A bag and a live capture of the same blocks become the same record.  The bag of a
+killed recorder is refused; with `ReadOptions.recover` its whole messages are read.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def opened_bag(path: str | Path, *, in_file_order: bool = False) -> Iterator[Bag
 
     The file may be compressed as a whole, or message by message.  `in_file_order` gives the
     messages as they were written, not by their log times.  Raises DataError if the path is no bag,
-    or has more damage than a killed recorder leaves; so does the iteration over the messages.
+    or has other damage than a killed recorder leaves; the iteration over messages does so, too.
     """
     path = Path(path)
     try:
@@ -250,9 +249,9 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
             continue
         for topic, _, message in _messages(bag, [connection]):
             base = topic.rpartition('/')[2]
-            # a damaged layout must not hide a topic that is ours by name
-            ours = base if base in ('voltage', 'displacement') else None
-            quantity = quantity_of(message.layout.dim) or ours
+            # the name of the topic replaces a damaged layout
+            named = base if base in ('voltage', 'displacement') else None
+            quantity = quantity_of(message.layout.dim) or named
             if quantity:
                 carried[topic] = quantity
             break
@@ -266,7 +265,7 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
 
 
 def is_computed(topic: str) -> bool:
-    """Return whether a model computes a topic."""
+    """Return whether a model computes the samples of a topic."""
     return topic.rpartition('/')[2] in ('prediction', 'residual', 'estimate')
 
 
@@ -314,7 +313,7 @@ def _topic_of(
             f'{path}: {", ".join(sorted(there))}: computed by a model, and no topic carries a '
             f'measured {quantity}; record a measured {quantity}, or name the topic to take'
         )
-    # applied_voltage carries the same quantity under another name
+    # the quantity of applied_voltage is voltage, too
     commanded = [t for t in measured if t.rpartition('/')[2] != APPLIED] or measured
     named = [t for t in commanded if t.rpartition('/')[2] == quantity]
     fit = named if len(commanded) > 1 and named else commanded

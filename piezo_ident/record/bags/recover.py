@@ -4,10 +4,10 @@
 """
 Read bags without an index: from the beginning of each file, message by message.
 
-An unfinished bag lacks metadata.yaml or the end of an mcap file, or the journal of a transaction
-lies beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all committed
-rows of a database.  Recovery does not change the bag: it applies journals to copies, and unpacks
-compressed files into copies.
+An unfinished bag lacks metadata.yaml or the end of an mcap file, or has the journal of a
+transaction beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all
+committed rows of a database.  Recovery applies journals to copies, and unpacks compressed files
+into copies, so the bag stays as it is.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _SIDECARS = ('-journal', '-wal')
 _BAG_FILE = re.compile(r'(?P<name>.+(?P<storage>\.mcap|\.db3))(\.zstd?)?', re.IGNORECASE)
 #: first bytes of zstd data; a message itself begins with a zero
 _ZSTD = b'\x28\xb5\x2f\xfd'
-#: most messages that a recorder compresses at once; it writes each when it is ready
+#: most messages that a recorder compresses at once, and may write in another order
 _AT_ONCE = 64
 _FORMATS = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
 

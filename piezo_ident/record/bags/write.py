@@ -6,7 +6,7 @@ Write bags: a whole record, or messages as they arrive.
 
 rosbags keeps an mcap chunk of 1 MiB in memory, and an sqlite3 bag in one transaction until the bag
 is closed.  `BagWriter` ends chunks and transactions early, so that messages are on disk soon.  The
-calls for this are internals of rosbags: `BagWriter` looks for them before the first message, and
+calls for this are internals of rosbags: `BagWriter` checks them before the first message, and
 `setup.py` bounds the version.
 """
 
@@ -38,7 +38,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-#: most numbered names that are tried
+#: most numbers of a taken name
 NAMES = 10_000
 
 _FOREVER = QosTime(9223372036, 854775807)
@@ -73,7 +73,7 @@ class BagWriter:
     Parameters
     ----------
     path : path
-        The folder to make; a taken name gets a number.
+        The new folder; a taken name gets a number.
     storage : {'mcap', 'sqlite3'}
     custom_data : mapping of str to str, optional
         Entries in the metadata of the bag.

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Lost, wild, repeated and stuck readings: one mask, decided once.
+Mark lost, wild, repeated and stuck readings in one mask.
 
-Every number of such a reading is in order, but it is no displacement of the stage.  The mask of a
-piece leaves it out of every fit, error, noise floor and stroke.  A straight line replaces it for
+Such a reading is a number, but no displacement of the stage.  The mask of a piece leaves the
+reading out of every fit, error, noise floor and stroke.  A straight line replaces the reading for
 filters and regressions, which need all samples.
 """
 
@@ -31,37 +31,37 @@ from piezo_ident.record.readings.jumps import (
 from piezo_ident.record.record import Fault, Piece, Record
 from scipy.special import bdtrc
 
-#: so many samples in a row with one displacement are no chance
+#: least samples in a row with one displacement that are no chance
 STUCK = 50
-#: the voltage moves by this share of its range while a sensor is stuck
+#: least motion of the voltage while a sensor is stuck, as a share of its range
 MOVED = 0.01
-#: the voltage is ahead of the displacement by this time at most [s]
+#: longest delay of the displacement behind the voltage [s]
 DELAY = 0.002
-#: share of the stroke at either end of its middle
+#: share of the stroke at either end that is not its middle
 MIDDLE = 0.02
 #: share of the range of the voltage that moves any stage in the middle of its stroke
 FIRM = 0.03
-#: samples of a window that shows noise
+#: samples of a window for noise
 WINDOW = 100
-#: least readings of one value in a row of a sensor that hangs
+#: least equal readings in a row of a sensor that hangs
 HELD = 2 * JUMP
-#: repeats are sought in motion whose readings repeat by chance at most in this share, and that
-#: moves by this share of the stroke a sample
+#: repeats are searched in motion with at most this share of repeats by chance, and at least this
+#: share of the stroke a sample
 CHANCE, CREEPS = 0.01, 3e-5
 #: least number of repeats in a moving signal, and least share of the moving samples
 REPEATS, REPEATED = 4, 2e-4
-#: least share of the repeats behind which the signal makes up for them, and the level of the test
-#: that pauses of the motion, which it makes up for by chance in half of the cases, are so many
+#: least share of repeats after which the signal catches up, and level of the test of their number
+#: against pauses of the motion, after which half of the signals catch up by chance
 MADE_UP, BY_CHANCE = 0.7, 1e-3
-#: samples that tell the step of a converter, in rows of so many
+#: samples that give the step of a converter, and samples of a row of them
 MOST, MOST_ROW = 2**17, 2**10
 #: share of that step by which numbers in a file may be rounded
 ROUNDED = 0.07
-#: larger shares of wild readings, or of held and repeated readings, are the way of the data
+#: largest shares of wild readings, and of held and repeated readings, that count as faults
 MAX_WILD, MAX_HELD = 0.15, 0.3
-#: the stroke is read so often without wild readings
+#: rounds of stroke and wild readings
 TURNS = 5
-#: least changes of a displacement that tell the rate of its sensor
+#: least changes of a displacement that give the rate of its sensor
 CHANGES = 100
 
 
@@ -69,9 +69,9 @@ def without_faults(record: Record) -> Record:
     """
     Return a record whose masks leave out the readings that are no displacement of the stage.
 
-    A straight line replaces them, and the voltage of a row that was lost as a whole.  They become
-    NaN in a channel with the displacement of another axis.  The faults of the record count them.
-    A record without them, or with masks, comes back as it is.
+    A straight line replaces such readings, and the voltage of a row that was lost as a whole; NaN
+    replaces them in a channel with the displacement of another axis.  Faults of the record count
+    them.  A record without such readings, or with masks, comes back as it is.
     """
     if any(piece.sound is not None for piece in record):
         return record
@@ -88,7 +88,7 @@ def _without_faults_of(record: Record, name: str) -> Record:
     own = f'v{name[1:]}'
 
     def turned(piece: Piece) -> Piece:
-        """Return a piece with this axis in front."""
+        """Return a piece whose first axis is this axis."""
         channels = {**piece.channels, **({own: piece.v} if own in piece.channels else {})}
         v = piece.channels.get(own, piece.v)
         return replace(piece, v=v, y=piece.channels[name], channels=channels, sound=None)
@@ -163,7 +163,7 @@ def _masked(piece: Piece, bad: Mask, span: float) -> Piece:
 def _wild(piece: Piece, stroke: float, span: float) -> Mask:
     """Mark the readings of a piece that jump away and come back while the voltage does not."""
     y = piece.y
-    # the voltages as the displacement [m] that they ask for; other axes may move this axis, too
+    # steps of the voltages as displacement [m]; other axes may move this axis, too
     asked = np.zeros(y.size)
     others = [x for k, x in piece.channels.items() if role_of(k) == 'v']
     for v, width in ((piece.v, span), *((x, float(np.ptp(x))) for x in others)):
@@ -197,11 +197,11 @@ def _marked(y: Array, bad: Mask, least: float) -> Mask:
 
 def _held(piece: Piece, stroke: float, span: float) -> Mask:
     """
-    Mark readings that stay at one value, and jump at the end to make up for it.
+    Mark readings that stay at one value, and jump to the true displacement at the end.
 
     A stage at rest, at the end of its range, or behind a saturated amplifier has no such jump.
-    Readings with noise that stay in the middle of the range while the voltage moves far hang, too.
-    A backlash may hold readings without noise.
+    Noisy readings that stay in the middle of the range while the voltage moves far hang, too.
+    Without noise, backlash may hold readings.
     """
     y, v = piece.y, piece.v
     found = np.zeros(y.size, dtype=bool)
@@ -232,7 +232,7 @@ def _held(piece: Piece, stroke: float, span: float) -> Mask:
 def _trembles(y: Array) -> bool:
     """Return whether noise turns readings at rest, shape (n,), back and forth."""
     steps = np.diff(y[:CHUNK])
-    # noise below the step of a converter turns two codes at their limit, and holds one between
+    # noise below the step of a converter alternates between two codes, or holds one code
     far = np.abs(steps[1:]) > 1.5 * quantum_of(y)
     turns = steps[1:] * steps[:-1] < 0.0
     turn, goes_far = (
@@ -260,10 +260,10 @@ def _repeated(y: Array, known: Mask) -> Mask:
     start, stop = start[inner], stop[inner]
     slope = np.abs(y[stop] - y[start - 1]) / (stop - start + 1)
     density = q / (np.sqrt(4.0 * np.pi) * sigma)
-    # the slope is itself known to about half a deviation
+    # the slope has an error of about half a deviation
     least = 2.0 * np.sqrt(np.log(max(density / CHANCE, 1.0))) + 1.0
     length = stop - start
-    # a missed reading is entered at speed, and behind it the signal makes up for it
+    # the signal moves before a missed reading, and catches up after it
     sign = np.sign(y[stop] - y[start - 1])
     before, after = sign * (y[start] - y[start - 1]), sign * (y[stop] - y[stop - 1])
     makes_up = (after - before) / np.maximum(length - 1, 1)
@@ -297,7 +297,7 @@ def white_noise(third: Array, quantum: float) -> float:
 
 
 def end_of_rest(piece: Piece, a: int, b: int) -> int:
-    """Return the end of a rest of the displacement for the voltage, which is ahead by a delay."""
+    """Return the end of a rest of the displacement, for the voltage, which is ahead."""
     return b - min((b - a) // 4, round(DELAY * piece.sample_rate))
 
 
@@ -317,7 +317,7 @@ def quantum_of(y: Array) -> float:
     span = float(np.ptp(y))
     if span == 0.0:
         return 0.0
-    # some whole stretches of a long signal tell the step as well
+    # some whole stretches of a long signal give the same step
     some = y
     if y.size > MOST:
         rows = y[: y.size // MOST_ROW * MOST_ROW].reshape(-1, MOST_ROW)
@@ -346,7 +346,7 @@ def quantum_of(y: Array) -> float:
     step = float(small[0])
     for _ in range(4):
         fitted = step
-        # rounded numbers far apart tell the step better
+        # rounded numbers far apart give the step better
         for most in (1.5, 5.0, 15.0, 50.0):
             near = small < most * fitted
             whole = np.rint(small[near] / fitted)

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Short gaps in a record, bridged for fitting.
+Bridge short gaps in a record for fitting.
 
-Reading splits a record wherever samples are missing, but the stage keeps its memory: in a short
-gap the voltage moves on to its next value, and the plays with it.  Straight lines join pieces of
-one clock.  If the displacement alone is missing, the voltage joins pieces over any time.  Every
-fit and every error leaves out a gap, and the moment after it.
+Reading splits a record where samples are missing, but the stage keeps its memory: in a short gap
+the voltage moves on to its next value, and the plays with it.  Straight lines join pieces of one
+clock.  If the displacement alone is missing, the voltage joins pieces over any time.  Every fit
+and every error leaves out a gap, and the time `SETTLING` after it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from piezo_ident.record.record import Piece, Record, Segment
 
 #: longest gap that is bridged by a straight line [s]
 LONGEST = 1.0
-#: a regression or a spectrum may run over so many lost readings in a row
+#: most lost readings in a row that a regression or a spectrum runs over
 FEW = 9
-#: time after a gap in which the dynamics still answer to the voltage in the gap [s]
+#: time after a gap in which the dynamics answer to the voltage in the gap [s]
 SETTLING = 0.01
 
 
@@ -32,8 +32,8 @@ class Bridged:
     """
     A piece with its gaps filled.
 
-    `sound` samples were measured without a fault, and a gap before them has died away.  `gaps` and
-    `filled` count the gaps without a voltage, and their samples.
+    `sound` samples were measured without a fault, and `SETTLING` after a gap.  `gaps` and `filled`
+    count the gaps without a voltage, and their samples.
     """
 
     piece: Piece
@@ -43,7 +43,7 @@ class Bridged:
 
 
 def follows(one: Piece, other: Piece) -> int | None:
-    """Return the number of samples that are missing between pieces; None for other clocks."""
+    """Return the number of missing samples between pieces; None for different clocks."""
     if abs(other.sample_rate / one.sample_rate - 1.0) > 1e-6:
         return None
     elapsed = (other.start_time - one.start_time) * one.sample_rate
@@ -62,7 +62,7 @@ def played_before(one: Piece, other: Piece) -> Piece | None:
 
 
 def connected_pieces(record: Record) -> list[list[Piece]]:
-    """Return the pieces of a record in groups; within a group, gaps are short."""
+    """Return the pieces of a record in groups with short gaps."""
     groups: list[list[Piece]] = []
     for piece in record:
         connects = groups and follows(groups[-1][-1], piece) is not None

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Readings that jump away from a signal and come back, as a sound signal does not.
+Find readings that jump away from a signal and come back.
 
-Jumps are steps far beyond the steps around them.  They cut the signal into parts.  The parts to
-leave out are those of least cost.  A sample left out costs 1.  A jump that is kept costs `JUMP`,
-or 0 if the voltage explains it.  A part that goes on at the end of the last kept part costs 0.
+Jumps are steps far larger than the steps around them, and cut the signal into parts.  The choice
+of the parts to leave out has least cost.  A sample left out costs 1.  A kept jump costs `JUMP`, or
+0 if the voltage explains it.  A part that goes on at the end of the last kept part costs 0.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ FAR, AROUND = 8.0, 16
 WIDTH = 2 * AROUND + 1
 #: least size of a jump in codes of a converter: noise turns two
 CODES = 3.0
-#: a quantile that holds if half of all steps are jumps, and the median over it of normal steps
+#: a quantile that half of the steps as jumps leave alone, and the median of normal steps over it
 QUANTILE = 0.3, 1.75
 #: rms of second over first differences of steps without memory (white noise: 1.73, a sine of five
 #: samples a period: 1.18)
 ROUGH = 1.3
 #: least size of large steps, as a share of the stroke (taste)
 LARGE = 0.1
-#: samples that a jump costs: two jumps enclose up to nine wild readings in a row, alike or not
+#: cost of a jump [samples]: two jumps enclose up to nine wild readings in a row
 JUMP = 5
-#: an excursion between two jumps is at most this share of a signal
+#: longest excursion between two jumps, as a share of a signal
 LONGEST = 0.1
-#: a part may go on at the end of one of so many parts before it
+#: number of parts before a part at whose ends it may go on
 PARTS = 256
-#: the voltage explains a jump if one step of it asks for this share of the jump
+#: the voltage explains a jump if a step of the voltage asks for this share of the jump
 STEPS = 0.3
-#: a stage moves by up to so many times the path that the voltage asks for
+#: largest path of a stage over the path that the voltage asks for
 OVER = 1.5
-#: a stage answers a step for so many samples
+#: longest answer of a stage to a step [samples]
 RINGS = 30
 
 
 def least_step(y: Array) -> float:
-    """Return the least step from one reading [m] to the next, infinite if none moves."""
+    """Return the least step between neighbouring readings [m], infinite without a step."""
     steps = np.abs(np.diff(y))
     return float(steps[steps > 0.0].min(initial=np.inf))
 
@@ -67,9 +67,9 @@ def wild_readings(
     """
     Mark the wild readings in the error, measured minus predicted displacement [m].
 
-    The prediction holds the motion by the voltage; `step` is the `least_step` of the `measured`
-    displacement.  Only a jump of the measured displacement is a wild reading: a goal out of reach
-    jumps as well.
+    The prediction has the motion by the voltage; `step` is the `least_step` of the `measured`
+    displacement.  Only a jump of the measured displacement is a wild reading, since a goal out of
+    reach may jump, too.
 
     >>> error = np.array([0.0] * 9 + [1.0] + [0.0] * 9)
     >>> wild_readings(error, stroke=10.0).nonzero()[0]
@@ -122,7 +122,7 @@ class Jumps:
         # mean squares of first and second differences
         run, bend = (uniform_filter1d(d * d, WIDTH)[at] for d in (step, np.diff(step, append=0.0)))
         answered = maximum_filter1d(asked, 2 * RINGS + 1)[at] >= STEPS * usual
-        # a motion has memory: large steps without memory or voltage are wild, not usual
+        # a motion has memory: large steps without memory or voltage are wild
         wild = (usual > LARGE * stroke) & (bend > ROUGH**2 * run) & ~answered
         usual = np.where(wild, 0.0, usual)
         far = size[at] > FAR * usual
@@ -177,7 +177,7 @@ class Jumps:
 
 
 def _usual(x: Array, at: Integers) -> Array:
-    """Return the median of normal x >= 0 around places; half of x may be anything."""
+    """Return the median of normal x >= 0 around places; half of x may be jumps."""
     if not at.size:
         return np.empty(0)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(x, AROUND, 'symmetric'), WIDTH)

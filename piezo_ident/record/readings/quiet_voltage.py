@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The voltage of a record without the noise of its own measurement.
+Remove the noise of a measured voltage.
 
 Many labs record the monitor of the amplifier instead of the command.  The noise of a monitor adds
-a path of many spans in a minute, and the stage does not follow that path.  Laws with lags along
-the path would follow time, and a hold would be a motion.  A play as wide as the noise replaces the
-voltage as long as only noise moves it.  The voltage of a motion stays.
+a path of many spans a minute, which the stage does not follow.  Laws with lags along the path
+would follow time, and a hold would be a motion.  A play as wide as the noise therefore replaces
+the voltage while only noise moves it.  The voltage of a motion stays.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 WINDOW, QUIET = 100, 10.0
 #: width of the play, in standard deviations of the noise
 WIDTH = 8.0
-#: widest play, as a share of the range: a program plays larger noise
+#: widest play, as a share of the range: larger noise belongs to a program
 MOST = 5e-3
-#: a moving voltage moves by so many widths within so many samples
+#: least widths by which a moving voltage moves, within so many samples
 MOVES, AROUND = 3.0, 9
-#: samples over which the mean lag of a play is put back
+#: samples over which the lag of a play is averaged and removed
 BACK = 300
 #: least rms of second over first differences of white noise; sqrt(3) is expected
 WHITE = 1.4
@@ -43,12 +43,12 @@ def with_quiet_voltage(record: Record) -> Record:
     """
     Return a record without noise of a voltage at rest or in slow motion.
 
-    A fault of the record tells the size of the noise; a record without noise comes back as it is.
+    A fault of the record gives the size of the noise; a record without noise comes back as it is.
     """
     span = float(np.ptp(record.voltage_range))
     if span == 0.0 or any(fault.name == 'voltage_noise' for fault in record.faults):
         return record
-    # a monitor is noisy in all pieces: a program plays the noise of a single piece
+    # a monitor is noisy in all pieces; noise of a single piece belongs to a program
     long = [piece.v for piece in record if piece.n >= 3 * WINDOW]
     deviation = min(map(_deviation, long), default=0.0)
     width = WIDTH * deviation
@@ -96,7 +96,7 @@ def _quiet(v: Array, width: float) -> Array:
     """Return a voltage [V] without noise of some width; a moving voltage stays."""
     still = _played(v, width)
     reach = maximum_filter1d(still, AROUND) - minimum_filter1d(still, AROUND)
-    # the play lags by half a width: its mean lag is put back, without the noise of the mean
+    # the play lags by half a width: its mean lag is removed, without the noise of the mean
     near = still + uniform_filter1d(v - still, BACK)
     return np.where(reach > MOVES * width, v, _played(near, width / np.sqrt(BACK)))
 

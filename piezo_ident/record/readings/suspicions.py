@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Doubts about a record whose readings are all used.
+Find doubts about a record that leave out no reading.
 
 The first rise of a stage after a rest, or from a lower voltage, has a curve of its own.  The stage
 then does not come back to its first position.
@@ -18,13 +18,13 @@ from piezo_ident.common.arrays import true_runs
 from piezo_ident.record.readings.faults import constant, end_of_rest, MOVED, period_of
 from piezo_ident.record.record import KINDS, Piece, Record
 
-#: two rests lie within this share of the voltage's range
+#: largest distance of two rests at one voltage, as a share of the range
 NEAR = 0.005
 #: least seconds and samples of a rest
 REST, REST_SAMPLES = 0.05, 10
-#: share of its range that the voltage goes between the two rests
+#: least way of the voltage between the two rests, as a share of the range
 AWAY = 0.5
-#: the later rests lie beyond the first by this share of the stroke; creep leaves 0.005 to 0.02
+#: least distance of later rests from the first, as a share of the stroke; creep: 0.005 to 0.02
 BEYOND = 0.03
 
 
@@ -111,7 +111,7 @@ def _stopped(record: Record) -> list[str]:
             if np.ptp(v) > MOVED * span:
                 levels.append(float(piece.y[start]))
                 stuck += stop - start
-            # a command does not tremble, a sensor does
+            # a sensor trembles, a command does not
             turns = np.diff(v)[1:] * np.diff(v)[:-1] < 0.0
             noisy += stop - start if turns.mean() > 0.3 else 0
     v_rests = any(constant(piece.v) for piece in record)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records in files of named arrays: npz, MATLAB, HDF5, TDMS and Parquet, each by its library.
+Read files of named arrays: npz, MATLAB, HDF5, TDMS and Parquet, each by its library.
 
 A file whose arrays are called ``t``, ``v`` and ``y`` is read as it is.  In any other file,
 `piezo_ident.record.tables.columns` chooses among all columns of numbers.
@@ -36,7 +36,7 @@ _HDF5 = b'\x89HDF\r\n\x1a\n'
 
 
 def read_npz(path: Path, options: ReadOptions) -> RecordTable:
-    """Read a NumPy archive; pickled objects are refused, or left alone beside the record."""
+    """Read a NumPy archive; pickled objects are refused in the record, and ignored beside it."""
     with damage_as_data_error(path, 'no npz archive', 'save it again with numpy.savez'):
         with zipfile.ZipFile(path) as archive:
             _check_size(sum(info.file_size for info in archive.infolist()))
@@ -69,7 +69,7 @@ def read_mat(path: Path, options: ReadOptions) -> RecordTable:
 
 
 def read_hdf5(path: Path, options: ReadOptions) -> RecordTable:
-    """Read an HDF5 file, MATLAB's version 7.3 among them."""
+    """Read an HDF5 file, such as MATLAB's version 7.3."""
     h5py = library('h5py', path)
     arrays: dict[str, Any] = {}
     size = 0
@@ -129,7 +129,7 @@ def read_tdms(path: Path, options: ReadOptions) -> RecordTable:
             if 'wf_increment' in channel.properties:
                 periods[name] = float(channel.properties['wf_increment'])
         cut = getattr(file.file_status, 'channel_statuses', None) or {}
-    # of channels that end at one sample, nothing but the end is missing
+    # channels that end at one sample lack the end of the record alone
     uneven = len({len(channel) for channel in channels}) > 1
     for name, part in cut.items():
         if uneven and part.read_length < part.expected_length:
@@ -170,7 +170,7 @@ def _renamed(
 
 
 def library(module: str, path: Path, package: str = '') -> Any:
-    """Import the reader of a kind of file; DataError with the command that installs it."""
+    """Import the library of a kind of file; DataError with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -193,7 +193,7 @@ def _table(
     options: ReadOptions,
     periods: Mapping[str, float] = MappingProxyType({}),
 ) -> RecordTable:
-    """Choose the columns among some arrays, and check them; `periods` of columns are in s."""
+    """Choose and check the columns among some arrays; `periods` are sampling periods [s]."""
     numbers = {k: np.asarray(x) for k, x in arrays.items() if k not in _LABELS}
     own = numbers.keys() >= {*options.needed}
     candidates = [
@@ -261,7 +261,7 @@ def _segments(arrays: Mapping[str, Any], path: Path) -> tuple[list[str], Any]:
 
 @contextmanager
 def damage_as_data_error(path: Path, kind: str, cure: str) -> Iterator[None]:
-    """Turn any error of a reader over a file, damaged or of another `kind`, into one line."""
+    """Turn any error of a reader into a DataError: the file is damaged or of another `kind`."""
     try:
         yield
     except DataError:

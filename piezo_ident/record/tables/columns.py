@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The quantity of each column of a file.
+Find the quantity of each column of a file.
 
-The names ``t``, ``v``, ``y``, ``segment``, ``x_<name>``, ``v_<name>`` and ``y_<name>`` say the
+The names ``t``, ``v``, ``y``, ``segment``, ``x_<name>``, ``v_<name>`` and ``y_<name>`` give the
 quantity.  Otherwise the words and the unit of a header decide, if one column alone fits; a fault
 reports the choice.  If no column or several columns fit, the error names the option that decides.
 """
@@ -38,7 +38,7 @@ _PERIODS = (
     r'd[tx]|ts|delta[tx]|(sampl(e|ing)|scan)(time|interval|period)|(wf|t|x|time)?incr?(ement)?|'
     r'timestep|hresolution'
 )
-#: names of numbers that are likely one of the two
+#: names of numbers that are likely a rate, or a period
 _LIKELY = (
     '.*(sampl|scan|acqui|record).*(rate|freq|clock).*',
     'sampling|interval|.*(sampl|scan|acqui|record|time).*(interval|incr|period|step|resol).*',
@@ -52,7 +52,7 @@ class RecordTable:
     Raw columns of a file, shape (n,), by quantity; without ``t`` if the `rate` [Hz] is known.
 
     `names` and `starts` are the label and the first row of each stretch, `ignored` the columns
-    that are not read, `units` those that the file or an option names.  `faults` report guesses.
+    that are not read, `units` the units in the file or the options.  `faults` report guesses.
     """
 
     columns: dict[str, Array]
@@ -81,8 +81,8 @@ def choose(
     """
     Return the place of each quantity among the columns, and a table that lacks the columns.
 
-    The names stand as in the file, some of them perhaps empty or twice.  A sampling rate may be
-    among the `scalars`, numbers beside the columns; `empty` are the places of empty columns.
+    The names are those of the file; a name may be empty or stand twice.  The `scalars`, numbers
+    beside the columns, may hold a sampling rate; `empty` are the places of empty columns.
     DataError for a missing or ambiguous quantity; the message names the option and the file.
     """
     given = {role: _place(role, name, names, path) for role, name in options.named.items()}
@@ -152,7 +152,7 @@ def _guessed(
         near = [i for i in free if i not in guessed.values() and not _is_apart(role, i, names)]
         fitting = _fitting(role, [(i, names[i]) for i in near])
         if len(fitting) > 1:
-            # of several groups, the group whose columns are named already
+            # of several groups, the group of the known columns
             groups = {_group(names[i]) for i in {*places.values(), *guessed.values()}} - {''}
             fitting = [i for i in fitting if _group(names[i]) in groups] or fitting
         if len(bare := [i for i in fitting if name_and_unit(names[i])[0] == role]) == 1:
@@ -160,7 +160,7 @@ def _guessed(
             fitting = bare
         if len(fitting) > 1:
             found = [names[i] for i in fitting]
-            # numbers tell equal names apart
+            # numbers distinguish equal names
             ways = found if len({*found}) == len(found) else [str(i + 1) for i in fitting]
             first, second = (_option(role, way) for way in ways[:2])
             fault = f'{len(found)} columns may be the {_QUANTITIES[role]} ({listed(found)})'
@@ -170,7 +170,7 @@ def _guessed(
 
 
 def _is_apart(role: str, place: int, names: Sequence[str]) -> bool:
-    """Tell whether a column is of a further axis: y_b, with v_b beside v."""
+    """Return whether a column belongs to a further axis: y_b, with v_b beside v."""
     bases, partner = [name_and_unit(name)[0] for name in names], {'v': 'y', 'y': 'v'}.get(role, '')
     return bool(role_of(bases[place])) and {partner, partner + bases[place][1:]} <= {*bases}
 
@@ -198,7 +198,7 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
     low = wanted.strip().casefold()
     is_number = wanted.isdecimal() and 1 <= int(wanted) <= len(names)
     words = None if is_number else words_of(wanted) or None
-    # channel 1 of an oscilloscope is called 1 [V], and is no first column
+    # a wanted 1 is the first column, not the channel 1 [V] of an oscilloscope
     others = [] if is_number else [name_and_unit(name)[0] for name in names]
     for ways, one in (
         ([*names], wanted),
@@ -230,7 +230,7 @@ def _group(name: str) -> str:
 
 def words_of(name: str) -> tuple[str, ...]:
     """
-    Return the words of a name: programs write the path to a column in their own ways.
+    Return the words of a name, since programs write the path to a column in different ways.
 
     >>> words_of("/'Log'/'Strain gauge'"), words_of('out.signals(2).values')
     (('log', 'strain', 'gauge'), ('out', 'signals', '2', 'values'))
@@ -278,7 +278,7 @@ def _rate_of(
 
 def rate_option(scalars: Mapping[str, float]) -> str:
     """
-    Return an option with a sampling rate: a likely one among some numbers, or an example.
+    Return an option with a likely sampling rate among some numbers, or with an example.
 
     >>> rate_option({'Recording step [ms]': 0.5}), rate_option({'Trigger [V]': 0.5})
     ('--rate 2000', '--rate 20e3')
@@ -301,7 +301,7 @@ def _unit_of(
     if not unit or (given and not kind):
         return given
     if number and kind == 'v' and plain != unit:
-        # the option counts in volts, whatever the header counts in
+        # the number of the option is for one volt, also under a header of mV
         return f'{float(number) / UNITS["v"][unit]:.15g}{plain}'
     if number and (kind == 'v' or not of_volts):
         return given
@@ -331,7 +331,7 @@ def _contradiction(
     _, plain, of_volts = split_unit(given)
     cure = 'leave the option out'
     if not of_volts:
-        # as many as the header counts in one volt
+        # how many of the header's unit make one volt
         cure += f', or overrule it by {option} {UNITS["v"].get(unit, 1.0):g}{plain}'
     return DataError(f'{column}in {unit} by the header, and {option} says {given}; {cure}')
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-MATLAB files, read by SciPy in a process of its own.
+Read MATLAB files by SciPy in a child process.
 
-SciPy's reader takes memory for whatever shape a damaged file announces, and some damage ends its
+SciPy's reader takes memory for any shape that a damaged file announces, and some damage ends its
 process with SIGSEGV.  A child process therefore reads the file, with a limit on its memory, and
 sends the columns back.
 """
@@ -42,8 +42,8 @@ def read_variables(path: Path, wanted: str, needed: Iterable[str] | None) -> Col
     Return the names of all variables of a MATLAB file of version 4 to 7, and the wanted ones.
 
     `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
-    arrays of str.  If the file lacks one of those `needed`, or they are None, all its columns of
-    numbers are returned, also in structs (see `flat`), and the names are those of the columns.
+    arrays of str.  If the file lacks a `needed` variable, or `needed` is None, all columns of
+    numbers are returned instead, also in structs (see `flat`), with the names of the columns.
     The last mapping gives the name of a column by the path to it, if a title names the column.
     ValueError for a damaged or too large file, or a wanted variable without numbers or texts.
     """
@@ -98,7 +98,7 @@ def _read(path: str, wanted: str, asked: str) -> Columns:
     names = [name for name, *_ in scipy.io.whosmat(path)]
     has_all = {*asked.split(',')} <= {*names}
     used = [name for name in names if not has_all or re.fullmatch(wanted, name)]
-    # without names SciPy would read all of them
+    # without names SciPy would read all variables
     read = scipy.io.loadmat(path, variable_names=used) if used else {}
     arrays: dict[str, Any] = {}
     paths: dict[str, str] = {}
@@ -136,7 +136,7 @@ def flat(name: str, value: Any, *, titled: bool = True) -> Iterator[tuple[str, N
             titles = [_title(struct) if is_titled else '' for struct in x.ravel()]
             for i, (title, cell) in enumerate(zip(titles, part.ravel(), strict=True), 1):
                 plain = key if part.size == 1 else f'{i}.{key}'
-                # two may be called alike
+                # two signals may have one title
                 title = title if titles.count(title) == 1 else ''
                 yield from flat(f'{name}.{title or plain}', cell, titled=titled)
     if x.dtype.kind in 'biufM':

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The layout of a text file: separator, header and first row.
+Find the layout of a text file: separator, header and first row.
 
-Instruments write anything above their table.  The table begins with the first rows of numbers.
-Its header is the last line above them; a line of units may stand between the two.
+Instruments write other text above their table.  The table begins with the first rows of numbers.
+Its header is the last line above these rows; a line of units may stand in between.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Layout:
     """
     Separator, names of the columns if a line names them, and number of lines above the rows.
 
-    `numbers` stand alone behind a name above the table; `empty` are the places of columns without
+    `numbers` are numbers behind a name above the table; `empty` are the places of columns without
     a cell in the first rows.
     """
 
@@ -69,7 +69,7 @@ def find_layout(lines: Sequence[str]) -> Layout | None:
     filled = [i for i, line in enumerate(lines) if line.strip()]
     if own := _own(lines, filled):
         return own
-    # a table with text in front comes last: LabVIEW lists the properties of channels
+    # tables behind a column of text come last, since LabVIEW lists properties of channels so
     for is_table in (_is_table, _is_table_behind_text):
         for k, i in enumerate(filled):
             following = [lines[j] for j in filled[k : k + 3]]
@@ -91,16 +91,16 @@ def _own(lines: Sequence[str], filled: Sequence[int]) -> Layout | None:
         if {'t', 'v', 'y'}.intersection(cells) and (separator or {'t', 'v'}.issubset(cells)):
             below = cells_of(next((lines[i] for i in filled if i > first), ''), separator)
             if any(below) and all(map(_is_unit, below)):
-                return None  # a second line of it
+                return None  # the header has a second line
             return Layout(separator, tuple(_as_wide(cells, below)), first + 1)
     return None
 
 
 def _is_table(rows: Sequence[Sequence[str]], separator: str | None) -> bool:
-    """Return whether rows, one behind the other, are the first of a table of numbers."""
+    """Return whether consecutive rows are the first rows of a table of numbers."""
     if separator == ',' and any(re.search(r'\d\s+[-+.\d]', cell) for cell in rows[0]):
         return False  # decimal commas between blanks
-    # the reader meets a spoiled second row; LabVIEW leaves unknown times empty
+    # the reader refuses a spoiled second row; LabVIEW leaves unknown times empty
     return all(sum(map(is_number, r)) > 1 and (not r[0] or is_number(r[0])) for r in rows[:2])
 
 
@@ -134,13 +134,13 @@ def _above(
         # LabVIEW lists the units of its columns far above them
         rows = [cells_of(lines[i], separator) for i in filled if lines[i].startswith(_LVM_UNITS)]
         units = ['', *rows[-1][1:]] if rows else []
-    # LabVIEW leaves a column of unknown times empty; one empty cell is none
+    # LabVIEW leaves a column of unknown times empty; one empty cell is no empty column
     some = [cells_of(line, separator) for line in lines[first : first + 100]]
     width = max(len(row), len(names))
     empty = {j for j in range(width) if not any(''.join(cells[j : j + 1]) for cells in some)}
     numbers = dict(filter(None, (_alone(lines[i], separator) for i in filled)))
     for j, (name, unit) in enumerate(zip(names, [*units, *[''] * len(names)], strict=False)):
-        # oscilloscopes write numbers above no column: Increment over 1e-3, or tInc = 1e-3
+        # oscilloscopes write numbers beside the columns: Increment over 1e-3, or tInc = 1e-3
         found = _alone(f'{name}={unit}' if is_number(unit) else name, separator)
         if found and j in empty:
             numbers |= [found]
@@ -173,7 +173,7 @@ def _alone(line: str, separator: str | None) -> tuple[str, float] | None:
 def _named(line: str, separator: str | None, need: int) -> list[str]:
     """Return the cells of a header, nothing for a line with too few cells."""
     cells = cells_of(line, separator)
-    # decimal commas make more of a row
+    # decimal commas split the cells of a row
     if separator and len(cells) >= (2 if separator == ',' else need):
         return cells
     # a header and its rows may have different separators

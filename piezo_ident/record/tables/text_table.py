@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records in text: CSV as spreadsheets of any country write it, and what LabVIEW and others write.
+Read tables in text: CSV of spreadsheets in any language, and files of LabVIEW and others.
 
 `piezo_ident.record.tables.text_layout` finds the table; NumPy reads its numbers.
 """
@@ -28,7 +28,7 @@ from piezo_ident.record.tables.columns import choose, rate_option, RecordTable
 from piezo_ident.record.tables.text_layout import COMMENT, find_layout, is_number, Layout
 from piezo_ident.record.tables.write import Blocks, ROWS
 
-#: the table begins within so many lines
+#: most lines above the table
 HEAD = 1000
 #: cells of programs that stand for no number, in lower case
 MISSING = ('', 'na', 'n/a', '#na', '#n/a')
@@ -42,7 +42,7 @@ _DAY = 86_400 * 10**9
 
 
 def read_text(path: Path, options: ReadOptions) -> RecordTable:
-    """Read a table in text, with anything above it."""
+    """Read a table in text, below any other text."""
     with path.open('rb') as file:
         marked = file.read(2) in (b'\xff\xfe', b'\xfe\xff')
     # utf-8-sig drops a byte order mark; cp1252 is what Windows writes in the west
@@ -84,7 +84,7 @@ def _rows(
     lines: Iterator[str], layout: Layout, places: dict[str, int], path: Path
 ) -> tuple[dict[str, Any], list[str], list[int]]:
     wanted = {name: i for name, i in places.items() if name != 'segment'}
-    # commas tear decimal commas apart: there, every cell has to be accounted for
+    # a comma as separator splits decimal commas: the reader then checks every cell
     width = len(layout.names) or layout.width
     use = range(width) if layout.separator == ',' else sorted({*places.values()})
     number = {*wanted.values()}
@@ -196,7 +196,7 @@ def _whole_rows(lines: Iterator[str]) -> list[str]:
 def _culprit(
     chunk: list[str], line: int, layout: Layout, wanted: dict[str, int], path: Path
 ) -> DataError:
-    """Return the error for the first of some lines that cannot be read."""
+    """Return the error for the first unreadable line."""
     width = len(layout.names) or layout.width
     separator = layout.separator
     reader: Any = csv.reader(chunk, delimiter=separator, strict=True) if separator else None

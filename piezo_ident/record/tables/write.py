@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Records as columns by name, and the writers of NumPy's npz and MATLAB's mat.
+Turn records into named columns, and write NumPy's npz and MATLAB's mat.
 
-``v_<name>`` and ``y_<name>`` are further axes, ``x_<name>`` further channels.  npz and mat carry
+``v_<name>`` and ``y_<name>`` are further axes, ``x_<name>`` further channels.  npz and mat hold
 ``segment_name`` and ``segment_start``, the first sample of each segment, counted from 0.
 """
 
@@ -47,7 +47,7 @@ def blocks_of(record: Record, **further: Sequence[Array]) -> Blocks:
 
 
 def labels_of(record: Record) -> tuple[list[str], list[int]]:
-    """Return the label of each stretch and its first row, nothing for unlabelled records."""
+    """Return the label and the first row of each stretch; empty for an unlabelled record."""
     labels: list[tuple[str, int]] = []
     offset = 0
     for piece in record:
