@@ -115,7 +115,7 @@ def _told(row: Row) -> tuple[str, str]:
 def _print(
     rows: Sequence[Row], bad: Sequence[Row], console: Console
 ) -> dict[str, dict[str, float]]:
-    """Print a summary of all records; return the records that stand out."""
+    """Print a summary of all records; return the outliers."""
     console.say(f'{len(rows) - len(bad)} of {len(rows)} records done; {len(bad)} failed')
     for row in bad[:PRINTED]:
         console.say(f'  {row.record}: {row.reason}')

@@ -24,7 +24,7 @@ from piezo_ident.record.io import READERS
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Fault, Record
 
-#: faults that are shown directly after reading a record
+#: faults that are printed directly after reading a record
 SHOWN = ('columns', 'slow_sampling', 'fast_sampling', 'large_stroke', 'large_gain', 'high_voltage')
 BAG_FILES = ('.mcap', '.db3')
 MODEL_FILES = ('.yaml', '.yml')
@@ -127,7 +127,7 @@ def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
 
 
 def fields_of(args: SimpleNamespace, kind: type) -> dict[str, Any]:
-    """Pick the given options that are fields of `kind`; absent options keep their defaults."""
+    """Pick the options that are fields of `kind`; absent options keep their defaults."""
     named = {f.name: getattr(args, f.name, None) for f in fields(kind)}
     return {name: x for name, x in named.items() if x is not None}
 
@@ -225,7 +225,7 @@ def check_output(
 
 
 def check_link(path: Path) -> None:
-    """Refuse a symbolic link that leads nowhere."""
+    """Refuse a symbolic link without a target."""
     broken = broken_link(path)
     if broken:
         raise DataError(f'{path}: {broken}')
@@ -282,6 +282,6 @@ def check_apart(output: Path, record: Path) -> None:
 
 
 def _try(folder: Path) -> None:
-    # only a real file tells: root passes all permission bits, and a file system may be read-only
+    # a test by a real file: root passes all permission bits, and a file system may be read-only
     with tempfile.TemporaryFile(dir=folder, prefix='.piezo_ident.'):
         pass

@@ -45,7 +45,7 @@ def _examples(lines: Sequence[str]) -> str:
 
 
 class Verb(click.Command):
-    """Verb with its options by sections; it only returns the parsed arguments."""
+    """Verb with its options by sections; a call returns the parsed arguments."""
 
     def __init__(
         self,

@@ -100,9 +100,9 @@ def _unit_of(quantity: str, role: str) -> click.Option:
     known = UNITS[role]
 
     def unit(text: str) -> str:
-        if not (found := scaled_unit(role, text)):
+        if not (scaled := scaled_unit(role, text)):
             raise click.BadParameter(f'{text!r} is no unit; give {", ".join(known)}')
-        return found
+        return scaled
 
     text = (
         f'Unit of {role} in the files (default: by the header, else {next(iter(known))}). '

@@ -25,10 +25,10 @@ def build_axes(
     """
     Build one sequence for each of several axes, with the same segments at the same samples.
 
-    Each axis has noise and multisines of its own, so the record tells which voltage moved which
-    axis.  All other signals are the same on every axis.  With `in_turn` each axis plays the
-    program alone, one after the other, while the other axes rest.  For a single axis the result
-    equals `Program.build`.  Limits and errors are those of `Program.build`.
+    Each axis has noise and multisines of its own, so a record shows which voltage moved which
+    axis.  All other signals are the same on every axis.  With `in_turn` the axes play the program
+    one after the other, while the other axes rest.  For a single axis the result equals
+    `Program.build`.  Limits and errors are those of `Program.build`.
 
     >>> import piezo_ident as pi
     >>> first, second = build_axes(pi.Program.load('two_axes'), 2)

@@ -25,9 +25,9 @@ class Option:
     """
     Option of a signal: its unit, its default, and its allowed values.
 
-    The default is `REQUIRED` if the option must be set, and None if it may be absent.  `many`
-    allows a list of numbers, `whole` numbers are at least one, `positive` numbers above zero.  An
-    option with `choices` is one of these words.
+    The default is `REQUIRED` for an option that must be set, and None for an option that may be
+    absent.  `many` allows a list of numbers, `whole` numbers are at least one, `positive` numbers
+    above zero.  The `choices` are the allowed words.
     """
 
     unit: str
@@ -85,8 +85,8 @@ class Part:
     """
     Part of a program without a ramp inside: its voltage v [V], shape (n,).
 
-    `end` is the level at which the signal would continue after its last sample [V].  `name`
-    distinguishes parts of the same kind, and may be empty.
+    `end` is the level at which the signal would continue after its last sample [V].  `name`, which
+    may be empty, distinguishes parts of the same kind.
     """
 
     v: Array

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Programs: named input signals in a row, with soft ramps between them, written as YAML.
+Programs: lists of named input signals with soft ramps in between, written as YAML.
 
     limits: [0, 10]          # V; no sample may leave them
     sample_rate: 20000       # Hz; by default the rate of the caller
@@ -137,7 +137,7 @@ class Program:
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> Program:
         """
-        Read a program that is shipped, such as ``identification``, or a file of the user.
+        Read a shipped program, such as ``identification``, or a file of the user.
 
         ConfigError if the file cannot be read, and in the cases of `parse_program`.
 
@@ -162,7 +162,7 @@ class Program:
         sample_rate : float, optional
             Sampling rate [Hz]; required if the program has none, and used instead of its rate.
         rng : numpy.random.Generator, optional
-            Generator of the random signals; by default one with the seed of the program.
+            Generator of the random signals; by default with the seed of the program.
         limits : tuple of float, optional
             Further limits, for example of the amplifier [V]; the narrower limits hold.
 

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Input signals, each a vector of volts.
+Make input signals, each a vector of volts.
 
 Every signal is half-open: its first value would follow its last sample (in a staircase, its last
-value).  Signals and the ramps between them therefore join without a repeated sample.  The
-generator in the arguments is the only source of randomness.
+value).  Signals and ramps therefore join without a repeated sample.  The generator in the
+arguments is the only source of randomness.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ PAPER_SLOPE = 6.0
 #: number of neighbouring odd lines of which one is left out
 GROUP = 4
 
-#: longest signal; more would not fit into the memory of a lab computer
+#: longest signal, for the memory of a lab computer [samples]
 MAX_SAMPLES = 50_000_000
 
 
 def sample_count(seconds: float, sample_rate: float) -> int:
-    """Count the samples of a signal; raises ConfigError for less than one, or too many."""
+    """Count the samples of a signal; ConfigError for less than one sample, or too many."""
     n = seconds * sample_rate
     if n < 0.5:
         raise ConfigError(f'{seconds:g} s is shorter than one sample; make it longer')
@@ -71,8 +71,7 @@ def corners(levels: Many[float], slope: float, sample_rate: float) -> Array:
     """
     Make straight lines through levels [V], all with the same magnitude of slope [V/s].
 
-    Every line takes a whole number of samples, so that each corner is met exactly.  The slope is
-    met within this rounding.
+    Every line takes a whole number of samples, so each corner is exact, and the slope is rounded.
     """
     v = np.asarray(levels, dtype=np.float64)
     seconds = np.abs(np.diff(v)) / slope

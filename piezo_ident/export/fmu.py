@@ -41,7 +41,7 @@ def write_fmu(
     sample_rate : float
         [Hz]
     rests : mapping of str to float
-        Voltage of each axis before it is set [V], by what follows ``voltage`` in its name.
+        Initial voltage of each axis [V], by the part of its name after ``voltage``.
     clocks : sequence of str
         Members of the state that count samples; ``k`` alone in the state of one axis.
     channels : mapping of str to str

@@ -5,10 +5,9 @@
 Export a model as a C header: prediction and feed-forward, sample by sample.
 
 Each operator has its C code beside its Python loop (`piezo_ident.operators.c_code.CCode`).  A
-header joins this code in the order of the chain.  The feed-forward has no equations of its own.
-Given its memory, the output of all operators in front of G is a function of the next voltage.  The
-feed-forward solves this function for the voltage.  `piezo_ident.control.linear_inverse` inverts G
-and its delay.
+header joins this code in the order of the chain.  The feed-forward uses the same code: with known
+memory, the output of all operators in front of G is a function of the next voltage, which the
+feed-forward solves for the voltage.  `piezo_ident.control.linear_inverse` inverts G and its delay.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from piezo_ident.export.links import Link, LinkGroup, links_of
 from piezo_ident.model.multi_axis import MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
-#: largest displacement that the inverse looks for [spans]
+#: largest displacement that the inverse searches [spans]
 FAR = 100.0
 #: width of a line of numbers or words [characters]
 WIDTH = 88
@@ -123,7 +122,7 @@ def export_c(
 
 
 def common_values(model: StageModel | MultiAxisModel, name: str, title: str) -> dict[str, Any]:
-    """List what every header has: names, title, version, rate and helpers."""
+    """List the values of every header: names, title, version, rate and helpers."""
     return {
         'p': name,
         'P': name.upper(),
@@ -149,7 +148,7 @@ def _feedforward_or_reason(
 
 def _feedforward_text(ff: _FeedForward, values: dict[str, Any]) -> str:
     """Write the part of the header with the feed-forward."""
-    # oldest first, as the past lies in memory
+    # oldest first, as in the memory of the filter
     listed = ', '.join(repr(float(x)) for x in ff.taps[::-1])
     return render(
         'feedforward.h',
@@ -178,7 +177,7 @@ def _feedforward(
     Q = whole = linear_inverse(replace(model, effects=rest))
     if preview is not None:
         Q = Q.shortened(preview)
-    # an effect that reads the command cannot be inverted, as the command is not known yet
+    # an effect that reads the command has no inverse, as the command is not known yet
     undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
     inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept
@@ -214,7 +213,7 @@ def _says(
     Q: LinearInverse,
     ahead: int,
 ) -> list[str]:
-    """Describe a feed-forward and the errors that it leaves."""
+    """Describe a feed-forward and its errors."""
     behind = ''
     if inverted.links:
         behind = f' The part behind it ({_named(inverted.links)}) is inverted likewise.'
@@ -250,7 +249,7 @@ def _named(links: Sequence[Link]) -> str:
 
 
 def checked_name(name: str) -> None:
-    """Refuse a name that is not allowed in C with a ConfigError."""
+    """Raise ConfigError for a name that is not allowed in C."""
     if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
         raise ConfigError(
             f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',

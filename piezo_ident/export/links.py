@@ -27,7 +27,7 @@ class Link:
     """
     Operator of the chain in C.
 
-    The `tag` is unique within the model.  It names the member with the state of the link, and the
+    The `tag`, unique within the model, names the member with the state of the link, and the
     functions of the link.
     """
 
@@ -42,11 +42,11 @@ class Link:
         return self.code.state.split('\n')[:-1]
 
     def given(self, text: str) -> list[str]:
-        """List the further signals that a text uses."""
+        """List the signals of `_GIVEN` that a text uses."""
         return [name for name in _GIVEN if name in _words(text)]
 
     def body(self, text: str) -> str:
-        """Put the numbers that a text uses in front of it, without empty lines."""
+        """Put definitions of the used numbers in front of a text, without empty lines."""
         used = _words(text)
         lines = [_constant(name, x) for name, x in self.code.numbers.items() if name in used]
         text = textwrap.dedent(text)

@@ -39,13 +39,13 @@ def export_modes(
     ----------
     model : MultiAxisModel
     modes : SharedModes
-        Of the model.
+        Modes of the model.
     name : str
         Beginning of all names in the header.
     title : str, optional
         First line of the header.
     feedforward : bool, optional
-        Has no effect, as there is none.
+        Has no effect: the header has no feed-forward.
     **drive
         Settings of a feed-forward, which are refused.
 

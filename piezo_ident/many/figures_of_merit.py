@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Figures of merit of a stage: a few numbers that can be compared between stages.
+Compute figures of merit of a stage: few numbers that can be compared between stages.
 
-The coefficients of G cannot be compared, since two identifications of the same stage may choose
-different orders.  The figures are read from the responses of H and of G.
+Coefficients of G cannot be compared, since two identifications of one stage may choose different
+orders.  The figures are read from the responses of H and of G.
 """
 
 from __future__ import annotations

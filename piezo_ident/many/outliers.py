@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Find records that stand out among many, and the columns in which they do."""
+"""Find outliers among many records, and their columns."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import statistics
 
 from piezo_ident.many.table import Row
 
-#: smallest number of values that tells how far apart the values of a column usually lie
+#: least values of a column that give its usual spread
 FEWEST = 8
-#: distance from the median that stands out, in standard deviations (estimated by the median of the
-#: distances), and its smallest value as a share of the median
+#: least distance of an outlier from the median, in standard deviations (from the median of the
+#: distances), and as a share of the median
 FAR, SHARE = 5.0, 0.02
-#: distance of a delay that stands out [samples]: a whole number may come out as its neighbour
+#: least distance of an outlying delay [samples]: a whole number may come out as its neighbour
 SAMPLES = 1.5
-#: columns that are compared by value, and columns that are compared by logarithm and stand out
-#: only above the median (errors and noise)
+#: columns compared by value, and columns compared by logarithm, with outliers only above the
+#: median (errors and noise)
 COMPARED = (
     *('sample_rate', 'duration', 'voltage_high', 'stroke', 'gain', 'loop_width'),
     *('delay_samples', 'bandwidth', 'resonance'),
@@ -28,13 +28,13 @@ ABOVE = (
     *('error_held_out', 'error_fitted', 'error_before', 'error_after', 'unexplained'),
     'noise_floor',
 )
-#: smallest ratio of an error that stands out to the median
+#: least ratio of an outlying error to the median
 TIMES = 1.25
 
 
 def stand_out(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """
-    Find the records that stand out, with the columns in which they do and the medians of these.
+    Find outlying records, and map them to their outlying columns with the medians.
 
     Examples
     --------

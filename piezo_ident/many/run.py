@@ -4,8 +4,8 @@
 """
 Identify or diagnose many records, each on its own and in a process of its own.
 
-The worker that reads a record also writes its results, so that workers on other machines only need
-the same folders.  A record that fails becomes a row with a reason, and the others go on.
+The worker that reads a record also writes its results, so workers on other machines only need the
+same folders.  A record that fails becomes a row with a reason.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Identify:
     verb = 'identify'
 
     def __call__(self, record: Record, name: str) -> tuple[Identification, dict[str, Value]]:
-        """Identify a record; the result and the cells of its row."""
+        """Identify a record; return the result and the cells of its row."""
         result = identify_axis(record, self.settings)
         return result, identified(result, record)
 
@@ -72,10 +72,10 @@ class Diagnose:
         return (inside if inside.is_dir() else self.models) / f'{name}.yaml'
 
     def __call__(self, record: Record, name: str) -> tuple[Diagnosis, dict[str, Value]]:
-        """Diagnose a record; the result and the cells of its row."""
-        given = self.model_of(name)
-        result = diagnose_axis(load(given), record, self.settings)
-        return result, {'model': given.name, **diagnosed(result, record)}
+        """Diagnose a record; return the result and the cells of its row."""
+        model = self.model_of(name)
+        result = diagnose_axis(load(model), record, self.settings)
+        return result, {'model': model.name, **diagnosed(result, record)}
 
 
 Task = Identify | Diagnose
@@ -104,7 +104,7 @@ class _Job:
         return self.folder / 'reports' / self.name
 
     def settings(self) -> dict[str, Any]:
-        """Collect everything that the result depends on, except the record itself."""
+        """Collect the settings, version and paths that the result depends on."""
         task = json.loads(json.dumps(asdict(self.task), default=str))
         return {'version': __version__, 'path': str(self.path), 'report': self.report, **task}
 
@@ -112,8 +112,7 @@ class _Job:
         """
         List name, size and time of the input files.
 
-        A comparison with the time of the results would not do: a file that replaces another may
-        be older than the results.
+        The time of the results alone is not enough: a file that replaces another may be older.
         """
         files = [self.path, *sorted(self.path.iterdir() if self.path.is_dir() else ())]
         if isinstance(self.task, Diagnose):
@@ -135,7 +134,7 @@ class _Job:
     def __call__(self, tick: Tick = lambda step, share: None) -> Row:
         self.row_file.unlink(missing_ok=True)
         try:
-            # before the files are read, so that a file that changes meanwhile is read again
+            # before the reading, so that a file that changes meanwhile is read again
             inputs = self.inputs()
             result, values = self.task(record_io.read(self.path, self.task.reading), self.name)
             result.model.save(self.model_file)
@@ -177,7 +176,7 @@ def run_many(
     Identify or diagnose every record on its own.
 
     A record is skipped if `folder` holds its results from the same file with the same settings.
-    The same call therefore continues a run that was stopped.
+    The same call therefore continues a stopped run.
 
     Parameters
     ----------
@@ -239,8 +238,8 @@ def _prepare(records: Sequence[Path], folder: Path, task: Task, reports: bool) -
         if name in places:
             raise ConfigError(f'{places[name]} and {path}: both are called {name}; rename one')
         places[name] = path
-    given = [task.model_of(name) for name in places] if isinstance(task, Diagnose) else []
-    for path in (*places.values(), *given):
+    models = [task.model_of(name) for name in places] if isinstance(task, Diagnose) else []
+    for path in (*places.values(), *models):
         if path.resolve().is_relative_to(target):
             raise ConfigError(f'{folder}: holds the input {path}; choose another folder')
     mark = folder / MARK

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Table of many records: one row for each record, written as CSV."""
+"""Write the table of many records: one row for each record, as CSV."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _LAST = ('faults', 'warnings')
 
 def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     """
-    Make a key that sorts as people do: numbers by value.
+    Make a key that sorts numbers in a text by value.
 
     Examples
     --------

@@ -25,8 +25,7 @@ WAIT_FOR_SCHEDULER = 10.0
 @contextmanager
 def processes(jobs: int) -> Iterator[Submit]:
     """Yield a function that submits jobs to processes; a process that dies costs one job."""
-    # a second thread of BLAS would only wait, as the matrices are narrow; new processes inherit
-    # this
+    # for narrow matrices a second thread of BLAS only waits; new processes inherit the setting
     for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS', 'OMP_NUM_THREADS'):
         os.environ.setdefault(name, '1')
     local, workers = threading.local(), []
@@ -50,7 +49,7 @@ def processes(jobs: int) -> Iterator[Submit]:
         threads.shutdown(wait=False, cancel_futures=True)
         end()
         threads.shutdown()
-        # close the process of a thread that had only begun
+        # close the processes of threads that began meanwhile
         end()
 
 

@@ -8,20 +8,20 @@ The scale of the error is
 
     q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2 + (c_N N)^2,
 
-in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  The other kinds
-give the q of a kind k of K, and r_k^2 is its mean square of error over q.  A further kind has each
-r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and A. Ramdas, J.
-Am. Stat. Assoc. 118(544), 2023, doi:10.1080/01621459.2022.2060112.  The half width at level p is
-q lambda sqrt(1 + 1/K), where lambda solves
+in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  For each kind k
+of K kinds of motion, the other kinds give q, and r_k^2 is the mean square of error over q.  A new
+kind has each r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and
+A. Ramdas, J. Am. Stat. Assoc. 118(544), 2023, doi:10.1080/01621459.2022.2060112.  The half width
+at level p is q lambda sqrt(1 + 1/K), where lambda solves
 
     mean_k erf(lambda / (sqrt(2) r_k)) = p.
 
-The root stands for the error of the r_k; draws of 3 to 20 kinds so keep the level.  The share p
-counts samples over kinds of motion: a whole record may leave its band.
+The root stands for the error of the r_k; with it, draws of 3 to 20 kinds keep the level.  The
+share p counts samples over kinds of motion: a whole record may leave its band.
 
-Limits: the band holds for the stage as it was when the record was made, with the zero of its
-sensor.  Outside the excited range of the voltage it widens by the distance, as the slope of H is
-unknown there.  The band is infinite, which means not known, `FAR` outside the range or at `FAST`
+Limits: the band holds for the stage at the time of the record, with the zero of its sensor.
+Outside the excited range of the voltage the band widens by the distance, as the slope of H is
+unknown there.  The band is infinite, which means unknown, `FAR` outside the range or at `FAST`
 times the highest speed of the records.
 """
 
@@ -45,9 +45,9 @@ from scipy.special import erf, erfinv
 
 #: entry of a model file, below `identification`
 KEY = 'prediction_band'
-#: distance outside the excited range from which nothing is known, as a share of the range; taste
+#: largest distance outside the excited range with a known error, as a share of the range; taste
 FAR = 0.25
-#: speed from which nothing is known, over the highest speed of the records; taste
+#: largest speed with a known error, over the highest speed of the records; taste
 FAST = 3.0
 
 
@@ -92,7 +92,7 @@ class PredictionBand:
     def from_dict(cls, data: Mapping[str, Any]) -> PredictionBand:
         """Read a band of a model file; raise ModelError if it is damaged."""
         try:
-            # an older file has their rms alone
+            # an older file has the rms of the ratios
             ratios = data.get('ratios') or [data['ratio']] * int(data['kinds'])
             c, r = (np.array(x, dtype=np.float64) for x in (data['coefficients'], ratios))
             band = cls(c, r, float(data['speed']))
@@ -117,10 +117,10 @@ class BandStream:
     """
     Half width of a stream of predictions, block by block.
 
-    `plays` and `creep` tell whether the memory of the plays, and the creep from before, are known
-    at the start.  Otherwise the band contains all possible memory of the plays, until the voltage
-    has swept them, and the creep that may go on.  Raises ModelError if the model carries no band,
-    and ConfigError if the level does not lie between 0 and 1.
+    `plays` and `creep` say whether the memory of the plays, and the creep of earlier motion, are
+    known at the start.  Otherwise the band contains all possible memory of the plays, until the
+    voltage has swept them, and the creep that may go on.  Raises ModelError if the model carries
+    no band, and ConfigError if the level does not lie between 0 and 1.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class BandStream:
         self._count = 0
 
     def follow(self, v: Array, y: Array) -> Array:
-        """Compute the half width at voltages [V] and predictions [m]; infinite if not known."""
+        """Compute the half width at voltages [V] and predictions [m]; infinite if unknown."""
         model, band = self._model, self._band
         if not v.size:
             return np.empty(0)

@@ -5,13 +5,13 @@
 Calibrate a prediction band on the errors of whole kinds of motion, each of them held out in turn.
 
 The coefficients of the scale q are fitted to the rms errors of blocks, with equal weight for every
-kind.  Then each kind is predicted by the coefficients that the other kinds give.  Leaving out
-single samples would test nothing, because errors of neighbours are alike: D. R. Roberts
-et al., "Cross-validation strategies for data with temporal, spatial, hierarchical, or phylogenetic
-structure", Ecography 40(8), 2017, doi:10.1111/ecog.02881.
+kind.  Then the coefficients of the other kinds predict each kind.  Leaving out single samples
+would test nothing, because errors of neighbours are alike: D. R. Roberts et al., "Cross-validation
+strategies for data with temporal, spatial, hierarchical, or phylogenetic structure", Ecography
+40(8), 2017, doi:10.1111/ecog.02881.
 
-H errs more on loops between the loops that it was fitted to.  A kind with fitted samples therefore
-counts with its error, or with the error that kinds without fits give for its motion if larger.
+H errs more on loops between the fitted loops.  A kind with fitted samples therefore counts with
+its own error, or with the error that kinds without fits give for its motion, whichever is larger.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BLOCKS, SHORTEST = 80, 20
 #: smallest scale of the error in spans: a tenth of a bit of a 16 bit converter
 LEAST = 1.5e-6
 #: weight of the prior, the error of all blocks over the largest value of the motion, against one
-#: block (taste: it decides only coefficients that the blocks leave open)
+#: block (taste: the prior decides only coefficients that the blocks leave open)
 PRIOR = 1e-3
 
 
@@ -79,7 +79,7 @@ def blocks_of(
     model: StageModel, runs: Sequence[JudgedRun], excess: Mapping[str, float] | None = None
 ) -> Blocks | None:
     """
-    Cut judged runs into blocks by the segments of their records; None if too few count.
+    Cut judged runs into blocks by the segments of their records; None with too few samples.
 
     `excess` is added to the mean squared errors, by the label of a segment [m^2].
     """
@@ -115,7 +115,7 @@ def blocks_of(
 
 
 def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
-    """Compute the ratio of mean squared errors: samples held out to all samples."""
+    """Compute the mean squared error of samples held out over that of all samples."""
     own = use & held
     if min(own.sum(), (use & ~held).sum()) < SHORTEST or not e2[use].any():
         return 1.0

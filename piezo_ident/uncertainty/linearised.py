@@ -22,9 +22,9 @@ from piezo_ident.selection.judged import Judged, JudgedRun
 
 #: number of blocks of each step, and most rows of its equations (time)
 BLOCKS, MOST_ROWS = 30, 100_000
-#: most samples times parameters: a further second of processor time for each 1e8 or so
+#: most samples times parameters: 1e8 take about a second of processor time
 MOST_WORK = 3e8
-#: kinds of segments that the steps of labelled records fit H and G to
+#: kinds of segments to which the steps of labelled records fit H and G
 STEPS = 'triangle', 'noise'
 
 
@@ -61,7 +61,7 @@ def stage_of(model: StageModel, name: str, records: int = 1) -> Stage:
 def _stretches(model: StageModel, runs: Sequence[JudgedRun]) -> list[Stretch]:
     """Take the samples that the steps fitted, each step in `BLOCKS` blocks of one size."""
     size = {kind: max(1, sum(int(_fitted(run, kind).sum()) for run in runs)) for kind in STEPS}
-    every, before, found = -(-sum(size.values()) // MOST_ROWS), 0.0, list[Stretch]()
+    every, before, parts = -(-sum(size.values()) // MOST_ROWS), 0.0, list[Stretch]()
     for i, run in enumerate(runs):
         own = {kind: _fitted(run, kind) for kind in STEPS}
         count = before + sum((np.cumsum(x) / size[kind] for kind, x in own.items()), np.zeros(1))
@@ -69,8 +69,8 @@ def _stretches(model: StageModel, runs: Sequence[JudgedRun]) -> list[Stretch]:
         use = np.any(list(own.values()), axis=0) & (np.arange(n) // 20 % every == 0)
         u, x = model.scaling.u(run.piece.v), model.scaling.x(run.piece.y)
         block = np.minimum(count * BLOCKS, len(STEPS) * BLOCKS - 1).astype(int)
-        found.append(Stretch(u, x, use, block, run.piece.sample_rate, i, i))
-    return found
+        parts.append(Stretch(u, x, use, block, run.piece.sample_rate, i, i))
+    return parts
 
 
 def _fitted(run: JudgedRun, kind: str) -> Mask:

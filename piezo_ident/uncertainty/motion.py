@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Describe motion sample by sample by its swing, speed and nesting, with which free runs err more.
+Describe each sample of a motion by swing, speed and nesting, with which errors of free runs grow.
 
-- Swing: the distance between the last two turning points of the voltage, or from the last of them
-  to the voltage, whichever is larger.  The misfit of H grows with the loop that is travelled.
+- Swing: the distance between the last two turning points of the voltage, or from the last turning
+  point to the voltage, whichever is larger.  The misfit of H grows with the size of the loop.
 - Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
-  of G.  The misfit of G and of the delay grows with it.
+  of G.  The misfit of G and of the delay grows with speed.
 - Nesting: the squared mean of one minus swing over the last range of path (taste).  Small loops
-  inside a wide one drift on many stages, and a sum of plays closes them.
+  inside a wide loop drift on many stages, and a sum of plays closes them.
 
-All follow from the past alone, so a stream gives the same values as a whole record.
+All three follow from the past alone, so a stream gives the same values as a whole record.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from piezo_ident.common.kernel import alive, ordered_kernel
 from piezo_ident.model.stage_model import StageModel
 
 #: way back after which an extreme of the voltage counts as a turning point, as a share of the
-#: range (taste).  Noise of a measured voltage is smaller, and loops whose error matters are larger
+#: range (taste): more than noise of a measured voltage, less than loops whose error matters
 TURN = 2e-3
 #: shortest and longest time in which the speed of the past fades [samples, s]; taste
 FEWEST, LONGEST = 10.0, 0.1

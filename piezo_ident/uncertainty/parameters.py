@@ -4,12 +4,12 @@
 """
 State the quantities that a user reads from a model, with their standard deviations.
 
-A deviation tells how far another record of the same motion and noise would move a quantity.  The
-replicates of `piezo_ident.fitting.jackknife` give it.  A 95 % interval is the value with Student's
-quantile for one degree of freedom fewer than blocks, about twice the deviation, to either side.
+A deviation is how far another record of the same motion and noise would move a quantity, by the
+replicates of `piezo_ident.fitting.jackknife`.  A 95 % interval is the value plus and minus about
+two deviations: Student's quantile for one degree of freedom fewer than blocks.
 
-Limits: the delay is a whole number of samples and does not vary in these equations.  The error of
-the law of H is in the deviations as far as it differs from block to block.  An error that all
+Limits: the delay is a whole number of samples and does not vary in these equations.  Deviations
+contain the error of the law of H as far as it differs from block to block.  An error that all
 blocks share is a bias, which appears on other motion only.
 """
 
@@ -40,7 +40,7 @@ FREQUENCIES, LOWEST = 10, 1e-2
 SWINGS = (0.25, 0.5, 1.0)
 #: points of a quarter of a loop
 POINTS = 100
-#: farthest replica of a mode, as a share of its frequency: beyond this it is another mode
+#: largest distance of a replica from its mode, as a share of the frequency
 SAME_MODE = 0.2
 
 
@@ -57,13 +57,13 @@ def with_deviations(result: Identification, judged: Judged) -> Identification:
     near = fitted.stage.dynamics
     rows = list(_quantities(fitted.stage, model, frequencies, near))
     at = np.array([row.value for row in rows], dtype=np.float64)
-    found = []
+    replicas = []
     for stage in fitted.replicates():
         moved = [row.value for row in _quantities(stage, model, frequencies, near)]
-        found.append(np.concatenate([moved, _coefficients(stage)]))
+        replicas.append(np.concatenate([moved, _coefficients(stage)]))
     whole = np.concatenate([at, _coefficients(fitted.stage)])
-    std = deviations(np.array(found).reshape(-1, whole.size), whole)
-    # a mode that replicates lack is not known
+    std = deviations(np.array(replicas).reshape(-1, whole.size), whole)
+    # a mode that replicates lack is unknown
     told = np.where(np.isfinite(std), std, np.inf)
     quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=False)]
     known = {**model.identification, QUANTITIES: quantities}
@@ -95,9 +95,9 @@ def _of_coefficients(
     m, na = stage.law.thresholds.size, stage.dynamics.a.size
     own = np.isin(stage.law.thresholds, model.hysteresis.thresholds)
     weights, powers, a, b = np.split(std, [m, m + 3, m + 3 + na])
-    found = {**known.get(PARAMETERS, {}), 'weights': weights[own].tolist()}
-    found |= dict(zip(('p0', 'p1', 'p2'), powers.tolist(), strict=True))
-    return found | ({'a': a.tolist(), 'b': b.tolist()} if na == model.dynamics.a.size else {})
+    entry = {**known.get(PARAMETERS, {}), 'weights': weights[own].tolist()}
+    entry |= dict(zip(('p0', 'p1', 'p2'), powers.tolist(), strict=True))
+    return entry | ({'a': a.tolist(), 'b': b.tolist()} if na == model.dynamics.a.size else {})
 
 
 def _quantities(

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Give predicted records their band."""
+"""Compute the band of predicted records."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ def half_widths(
     """
     Compute the half width of the band of each piece of a record [m].
 
-    `estimated` tells for each piece whether its displacement gave the start.  Then the plays may
-    err until they are forgotten.  Without `estimated` the voltage alone is known.  A start at rest
-    then gives the plays, and the creep from before is in the band.
+    `estimated` says for each piece whether its displacement gave the start; the plays of such a
+    piece may err until they are swept.  Without `estimated` the voltage alone is known: a start at
+    rest gives the plays, and the band contains the creep of earlier motion.
     """
-    found = list[Array]()
+    half = list[Array]()
     for pieces in connected_pieces(record):
-        first = len(found)
+        first = len(half)
         if estimated is None:
             stream = BandStream(model, level, plays=is_at_rest(model, pieces[0]), creep=False)
         else:
             stream = BandStream(model, level, plays=not estimated[first])
         for piece in pieces:
-            found.append(stream.follow(piece.v, predicted[len(found)]))
-    return tuple(found)
+            half.append(stream.follow(piece.v, predicted[len(half)]))
+    return tuple(half)
 
 
 def with_half_widths(run: FreeRun, level: float, half: tuple[Array, ...]) -> FreeRun:
-    """Add half widths [m] to a free run, and a warning where nothing is known."""
+    """Add half widths [m] to a free run, and a warning about infinite half widths."""
     warnings = [f'{run.record.name}: {text}' for text in unknown_parts(half)]
     return replace(run, interval=level, half_widths=half, warnings=(*run.warnings, *warnings))
 
 
 def unknown_parts(half: Sequence[Array]) -> list[str]:
-    """Say for which share of the samples the error is not known; empty if it is known for all."""
+    """Return a warning with the share of infinite half widths; empty without any."""
     n, lost = sum(x.size for x in half), sum(int(np.isinf(x).sum()) for x in half)
     if not lost:
         return []

@@ -6,13 +6,13 @@ Promise the error of another record, and give the model its prediction band.
 
 The promise for the same kinds of motion is the rms error of the model on its records, raised to
 the error of held-out samples.  The promise for motion of another kind is the geometric mean of q
-times that of r_k (`piezo_ident.uncertainty.band`).  It is over all pairs of a swing, with its
-nesting, of one kind and a speed of another.  About half of the kinds err more.
+times the geometric mean of r_k (`piezo_ident.uncertainty.band`), over all pairs of a swing, with
+its nesting, of one kind and a speed of another kind.  About half of the kinds err more.
 
 After a diagnosis the refined model carries no hum, drift or wandering gain: they count in full.
 
-Limits: both are for the rms error over a whole record, in % of the stroke of the records that they
-come from.  The zero of the sensor does not count where it has clearly moved.
+Limits: both promises are for the rms error over a whole record, in % of the stroke of the judged
+records.  A zero of the sensor that has clearly moved does not count.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from piezo_ident.uncertainty.weights import weights_of
 
 
 def with_band(model: StageModel, band: PredictionBand) -> StageModel:
-    """Keep a band in the model, and so in its file."""
+    """Add a band to a model, and thus to its file."""
     return replace(model, identification={**model.identification, KEY: band.to_dict()})
 
 
@@ -68,7 +68,7 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     band = calibrated(other)
     promise = promise_of(same, other, band, abs(model.scaling.Y), stroke)
     if result.changes:
-        # the deviations belong to the given model
+        # the deviations belong to the model before the diagnosis
         known = {k: x for k, x in model.identification.items() if k != QUANTITIES}
         model = replace(model, identification=known)
     result = replace(result, model=with_band(model, band), promise=promise)
@@ -78,7 +78,7 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
 def promise_of(
     same: Blocks, other: Blocks, band: PredictionBand, span: float, stroke: float
 ) -> Promise:
-    """Promise the error of another record, from blocks of its kind and of other kinds."""
+    """Promise the error of another record, from blocks of the same kinds and of other kinds."""
     mean = float(np.average(same.square, weights=same.weight))
     swing, speed, nesting = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2, 3))
     k, m = (x.ravel() for x in np.indices((other.kinds, other.kinds)))
@@ -88,7 +88,7 @@ def promise_of(
 
 
 def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
-    """Run the refined model as on records that it never saw, at the zero of each record."""
+    """Run the refined model as on unseen records, at the zero of each record."""
     runs = []
     for r in result.residuals:
         y = result.model.predict_piece(r.piece, fit_start(result.model, r.piece, r.sound))
@@ -102,7 +102,7 @@ def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
 
 
 def excess(runs: Sequence[JudgedRun], held_out: Mapping[str, float]) -> dict[str, float]:
-    """Compute by how much held-out errors exceed those of the fit, by segment, squares [m^2]."""
+    """Compute by how much held-out squared errors exceed fitted ones, by segment [m^2]."""
     return {
         label: max(held_out[label] - float(e.var()), 0.0)
         for label, e in errors_of_segments(runs).items()

@@ -4,8 +4,8 @@
 """
 Weigh the candidates of a diagnosis by their errors on kinds of motion that were held out.
 
-A set s of effects leaves the mean square E_s on N kinds of motion that were held out.  A kind
-counts as one observation of unknown size.  The weight of the set is
+A set s of effects leaves the mean square E_s on N kinds of motion held out.  A kind counts as one
+observation of unknown size.  The weight of the set is
 
     w_s = p_s (E_s / T^n)^(-N/2) / sum of all,
 
@@ -13,10 +13,10 @@ pseudo Bayesian model averaging: Y. Yao, A. Vehtari, D. Simpson and A. Gelman, "
 average Bayesian predictive distributions", Bayesian Analysis 13(3), 2018, doi:10.1214/17-BA1091.
 
 T is `TAKES`: an effect that leaves more than this share has taken the error of another law.  n is
-the number of effects; one that contains narrower effects counts twice.  ``none of these``, n = 0,
-stands for a stage that lacks nothing, and for a cause outside of the catalogue.  Its prior is
-`NONE`.  A further effect is `FURTHER` times as likely as the first one, and sets of one size are
-equally likely.
+the number of effects; an effect that contains narrower effects counts twice.  ``none of these``,
+n = 0, stands for a complete model, and for a cause outside of the catalogue.  Its prior is `NONE`.
+A further effect is `FURTHER` times as likely as the first effect, and sets of one size are equally
+likely.
 
 Limits: the number of kinds bounds how well E_s is known, and only sets that the search fitted are
 compared.  Effects with tests of their own, such as hum, have no weight.
@@ -34,7 +34,7 @@ from piezo_ident.effects import find_effect
 NOTHING = 'none of these'
 #: prior of none, and ratio of the priors of sets with one effect more (taste)
 NONE, FURTHER = 0.5, 0.25
-#: number of parts that stand for kinds of motion where the record has none
+#: number of parts of a record that replace kinds of motion
 PARTS = 5
 
 
@@ -65,6 +65,6 @@ def weights_of(errors: Mapping[tuple[str, ...], float], kinds: int) -> dict[str,
         steps = n + sum(bool(find_effect(name).contains) for name in effects)
         logs['+'.join(effects) or NOTHING] = np.log(prior) + power * np.log(square / TAKES**steps)
     most = max(logs.values(), default=0.0)
-    found = {name: float(np.exp(x - most)) for name, x in logs.items()}
-    total = sum(found.values())
-    return {k: x / total for k, x in sorted(found.items(), key=lambda item: -item[1])}
+    raw = {name: float(np.exp(x - most)) for name, x in logs.items()}
+    total = sum(raw.values())
+    return {k: x / total for k, x in sorted(raw.items(), key=lambda item: -item[1])}

@@ -37,16 +37,16 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     -------
     str
         C99 without dependencies.  A comment at its head explains the calls, and names the effects
-        that the feed-forward leaves uncorrected.  A model of several axes has a header for each
-        axis, then a step of the stage that takes all voltages.  Modes that the axes share have
-        such a step without a feed-forward.
+        that the feed-forward leaves uncorrected.  For several axes, a step of the stage that takes
+        all voltages follows the headers of the axes.  Shared modes have this step alone, without a
+        feed-forward.
 
     Raises
     ------
     DataError
-        When `model` is something else, or limits or slew are impossible.
+        When `model` is no model, or limits or slew are impossible.
     ConfigError
-        When the name is not allowed in C, or two axes have the same names there.
+        When the name is not allowed in C, or two axes have the same names in C.
     ModelError
         When an effect of the model has no C code, or the preview is shorter than the delay.
 
@@ -97,7 +97,7 @@ def export_fmu(
     Raises
     ------
     ConfigError
-        If the name is not an identifier in C, or two axes have the same names there.
+        If the name is not an identifier in C, or two axes have the same names in C.
     ModelError
         If an effect of the model has no C code.
     DataError
@@ -122,7 +122,7 @@ def export_fmu(
 
 
 def _states(model: StageModel | MultiAxisModel) -> dict[str, StageModel]:
-    """List the chains that the state of a header runs by its members; one chain has no member."""
+    """Map members of the state of a header to their chains; a single chain has no member."""
     if isinstance(model, StageModel):
         return {'': model}
     if model.modes is not None:
@@ -133,7 +133,7 @@ def _states(model: StageModel | MultiAxisModel) -> dict[str, StageModel]:
 
 
 def _further(states: Mapping[str, StageModel]) -> dict[str, str]:
-    """List the channels that a caller sets by their place in the state."""
+    """Map places in the state to the channels that a caller sets there."""
     return {
         f'{member}.channel[{k}]'.removeprefix('.'): channel
         for member, x in states.items()
@@ -157,15 +157,15 @@ def _stage(
     for member, x in states.items():
         is_own = member not in order
         i = order.index(member.removeprefix('own_'))
-        given = f'(&s->{member}, v[{i}]);'
+        arguments = f'(&s->{member}, v[{i}]);'
         step += [
             f'    s->{member}.channel[{k}] = own_y{channel[len(MOTION) :]};'
             for k, channel in enumerate(channels_of(x))
             if channel.startswith(MOTION)
         ]
         moved = f'const double {member}' if is_own else f'y[{i}]'
-        step.append(f'    {moved} = {tags[member]}_step{given}')
-        rest.append(f'    {"" if is_own else f"y[{i}] = "}{tags[member]}_reset{given}')
+        step.append(f'    {moved} = {tags[member]}_step{arguments}')
+        rest.append(f'    {"" if is_own else f"y[{i}] = "}{tags[member]}_reset{arguments}')
     further = [f' *     s.{x}  {plain_text(channel)}' for x, channel in _further(states).items()]
     call = f'{name}_state *s, const double v[{n}], double y[{n}]'
     return '\n'.join(

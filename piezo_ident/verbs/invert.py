@@ -22,8 +22,8 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 
-#: most rounds of an inversion of several axes, and the change of a voltage between two rounds that
-#: ends them [of the span of the model]
+#: most rounds of an inversion of several axes, and largest change of a voltage in the last round,
+#: as a share of the span of the model
 ROUNDS, SAME = 6, 1e-5
 
 
@@ -98,11 +98,10 @@ def invert(
     model : StageModel or MultiAxisModel
     wanted : array_like, shape (n,), or mapping of str to array_like
         Displacement [m], sampled at the rate of the model.  A model of several axes needs a
-        mapping by axis; an absent axis rests at the displacement of its lowest voltage, with
-        shared modes at that of the middle voltage of their fit.  The stage is taken to rest before
-        and after the motion.  The rest before it is the state after one stroke from the lowest
-        voltage, settled.  With creep, begin at the displacement of the lowest voltage, which does
-        not creep.
+        mapping by axis; an absent axis rests at the displacement of its lowest voltage, or with
+        shared modes of the middle voltage of their fit.  The stage rests before and after the
+        motion: before it in the settled state after one stroke from the lowest voltage.  With
+        creep, begin at the displacement of the lowest voltage, which does not creep.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     **options
@@ -123,7 +122,7 @@ def invert(
     Notes
     -----
     The motions of the other axes are a known disturbance of each axis.  The first round takes
-    their wanted motions, each later round their motions under the voltages of the round before.
+    the wanted motions of the other axes, each later round the motions under the last voltages.
 
     Examples
     --------
@@ -180,7 +179,7 @@ def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -
     """
     Return the wanted motion of every axis; raise DataError if the motions do not fit.
 
-    Absent axes of a model with shared modes stay absent.
+    With shared modes an absent axis stays absent.
     """
     if not isinstance(wanted, Mapping):
         raise DataError(

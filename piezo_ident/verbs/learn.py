@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identify and diagnose a stage of one axis, or of several axis by axis."""
+"""Identify and diagnose a stage of one axis, or several axes one by one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RESTS = 1e-3
 LONG = 1.0
 #: length of the blocks in which rest is judged [s]
 BLOCK = 0.25
-#: what a diagnosis does with the choice of an identification between chains and shared modes
+#: notes of a diagnosis on the choice of an identification between chains and shared modes
 ALREADY_TRIED = (
     'modes that the axes share were not tried: identify kept chains on the multisines of these '
     'records'
@@ -79,7 +79,7 @@ def identify(
     steps: Steps | None = None,
 ) -> Identification | EachAxis[Identification]:
     """
-    Identify a stage from its records, each of several axes by itself.
+    Identify a stage from its records, axis by axis.
 
     Parameters
     ----------
@@ -89,22 +89,22 @@ def identify(
         fitted as a whole, except for a part that is held out.  Columns ``v_<name>`` and
         ``y_<name>`` beside ``v`` and ``y`` are further axes.  The axes may move at once or one
         after the other, in one record or in several.  The last record gives the zero of
-        displacement, so give them in the order in which they were recorded.
+        displacement, so records come in the order of recording.
     settings : Settings, optional
     validation : sequence of Record, or Record, optional
         Unseen records, which take no part in the fit; the headline gives the error on them.
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
     steps : Steps, optional
-        Results of earlier steps, for a stage of one axis.  If they are given, even empty, records
-        without labelled segments are refused.
+        Results of earlier steps, for a stage of one axis.  With `steps`, even without results,
+        records without labelled segments are refused.
 
     Returns
     -------
     Identification, or EachAxis of Identification
-        The models of several axes lack the paths between them, which `diagnose` finds.  From
-        multisines of all axes at once, modes that the axes share predict instead of the models if
-        they err clearly less on multisines held out.
+        The models of several axes lack the paths between the axes, which `diagnose` finds.  With
+        multisines of all axes at once, modes that the axes share replace the chains if the modes
+        err clearly less on multisines held out.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def identify(
     if not any(of_axes[axis] for axis in axes if axis != 'y'):
         one = identify_axis(records, settings, validation=validation, progress=progress)
         return replace(one, warnings=(*one.warnings, *still))
-    found = {}
+    results = {}
     for axis, parts in of_axes.items():
         if parts:
             unseen, told = [axis_record(r, axis) for r in validation], _named(progress, axis)
             one = identify_axis(parts, settings, validation=unseen, progress=told)
-            found[axis] = replace(one, warnings=(*one.warnings, *still))
+            results[axis] = replace(one, warnings=(*one.warnings, *still))
     data = AxesData(records, validation, of_axes)
-    return with_better_modes(EachAxis(found), data, progress)
+    return with_better_modes(EachAxis(results), data, progress)
 
 
 @overload
@@ -182,7 +182,7 @@ def diagnose(
     progress: Progress = silent,
 ) -> Diagnosis | EachAxis[Diagnosis]:
     """
-    Find the effects that a model lacks, add them, and say how certain they are.
+    Find the effects that a model lacks, add them, and state their certainty.
 
     Parameters
     ----------
@@ -190,8 +190,8 @@ def diagnose(
         From `identify`; it may hold effects already.
     records : Record, or sequence of Record
         Measured data that took no part in the identification, at the sampling rate of the model.
-        If they exceed ``settings.most_samples``, the beginnings of the records are searched and
-        fitted, and a warning says how much this is.
+        Of more than ``settings.most_samples``, the beginnings of the records are searched and
+        fitted, and a warning gives their length.
     settings : DiagnosisSettings, optional
     progress : callable, optional
         Called with the name of the step and the share done; may raise `Cancelled`.
@@ -199,9 +199,8 @@ def diagnose(
     Returns
     -------
     Diagnosis, or EachAxis of Diagnosis
-        Each of several axes is judged with the motions of the others known.  The channel of a
-        `cross_coupling` names the axis that the coupling comes from.  A model with shared modes is
-        judged as it is.
+        Each axis is judged with the motions of the other axes.  The channel of a `cross_coupling`
+        names the axis that the coupling comes from.  A model with shared modes is judged as it is.
 
     Raises
     ------
@@ -236,7 +235,7 @@ def diagnose(
     if model.modes is not None:
         return diagnosed_modes(model, records, settings)
     seen = [model.seen(record) for record in records]
-    found = EachAxis(
+    results = EachAxis(
         {
             axis: diagnose_axis(
                 x, [of[axis] for of in seen], settings, progress=_named(progress, axis)
@@ -247,17 +246,17 @@ def diagnose(
     names = {*(settings.effects or (LOOP,))} - {*settings.without}
     sines = Multisines.of(model.axes, records) if LOOP in names else None
     if sines is None:
-        return found
+        return results
     if known := chains_were_kept(model, sines):
-        return found.mapped(functools.partial(_warned, ALREADY_TRIED))
-    shared = find_shared_modes(found.model, sines, records, progress)
+        return results.mapped(functools.partial(_warned, ALREADY_TRIED))
+    shared = find_shared_modes(results.model, sines, records, progress)
     if known is not None:
-        found = found.mapped(functools.partial(_warned, TRIED_AGAIN))
+        results = results.mapped(functools.partial(_warned, TRIED_AGAIN))
     if shared is None:
-        return found
-    found = replace(found, modes=shared.modes)
-    predicted = [(record, found.model.predicted(record)) for record in records]
-    order = sorted(found)
+        return results
+    results = replace(results, modes=shared.modes)
+    predicted = [(record, results.model.predicted(record)) for record in records]
+    order = sorted(results)
 
     def judged_and_promised(axis: str, x: Diagnosis) -> Diagnosis:
         runs = {
@@ -268,7 +267,7 @@ def diagnose(
         own = {label: float(of[order.index(axis)]) for label, of in shared.held_out.items()}
         return promised_modes(with_shared_modes(x, shared, runs), own)
 
-    return found.mapped(judged_and_promised)
+    return results.mapped(judged_and_promised)
 
 
 def _warned(text: str, _: str, result: Diagnosis) -> Diagnosis:

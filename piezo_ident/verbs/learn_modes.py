@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Take modes that axes share into an identification, and judge them in a diagnosis."""
+"""Add modes that axes share to an identification, and judge such modes in a diagnosis."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from piezo_ident.selection.judged import JudgedRun
 from piezo_ident.verbs.predict import free_run
 from piezo_ident.verbs.promised_modes import judged_modes
 
-#: entry below `identification` of a chain: `Multisines.digest` of records on which it was kept
+#: entry of `identification` of a chain: `Multisines.digest` of records on which chains were kept
 CHAINS_KEPT = 'chains_kept_on'
 #: why chains are kept although modes err less on multisines
 BUT = 'shared modes err less on multisines held out, but chains are kept:'
@@ -52,7 +52,7 @@ BUT = 'shared modes err less on multisines held out, but chains are kept:'
 
 @dataclass(frozen=True, eq=False)
 class AxesData:
-    """Records of a stage, those for validation, and by axis the records of its chain."""
+    """Records of a stage, records for validation, and records of each chain by axis."""
 
     records: Sequence[Record]
     validation: Sequence[Record]
@@ -60,26 +60,26 @@ class AxesData:
 
 
 def with_better_modes(
-    found: EachAxis[Identification], data: AxesData, progress: Progress
+    chains: EachAxis[Identification], data: AxesData, progress: Progress
 ) -> EachAxis[Identification]:
     """
-    Let shared modes predict instead of the chains if they err clearly less.
+    Replace chains by shared modes if the modes err clearly less.
 
-    The comparison is that of `find_shared_modes` on multisines held out.  On other motion of the
-    records, the modes must not err more than the chains.
+    `find_shared_modes` compares both on multisines held out.  On other motion of the records, the
+    modes must not err more than the chains.
     """
-    sines = Multisines.of(found, data.records)
+    sines = Multisines.of(chains, data.records)
     if sines is None:
-        return found
-    finding = find_shared_modes(found.model, sines, data.records, progress, tests=True)
+        return chains
+    finding = find_shared_modes(chains.model, sines, data.records, progress, tests=True)
     notes: tuple[str, ...] = ()
     if finding is not None:
         try:
-            taken = _with_modes(found, finding, data)
+            taken = _with_modes(chains, finding, data)
         except ModelError as error:
             notes = (f'{BUT} {error}',)
         else:
-            if not _err_elsewhere(taken, found, finding.held_out):
+            if not _err_elsewhere(taken, chains, finding.held_out):
                 return taken
             notes = (f'{BUT} modes err more on the other motion of the records',)
 
@@ -88,20 +88,20 @@ def with_better_modes(
         model = replace(x.model, identification=known)
         return replace(x, model=model, warnings=(*x.warnings, *notes))
 
-    return found.mapped(kept)
+    return chains.mapped(kept)
 
 
 def chains_were_kept(model: MultiAxisModel, sines: Multisines) -> bool | None:
-    """Tell whether an identification kept chains on these multisines; None if it had none."""
+    """Return whether an identification kept chains on these multisines; None if it had none."""
     known = {x.identification.get(CHAINS_KEPT) for x in model.axes.values()}
     return known == {sines.digest} if known != {None} else None
 
 
 def _with_modes(
-    found: EachAxis[Identification], finding: SharedModesFinding, data: AxesData
+    chains: EachAxis[Identification], finding: SharedModesFinding, data: AxesData
 ) -> EachAxis[Identification]:
-    """Replace errors, warnings, promise and band of each axis by those of the modes."""
-    model, order = replace(found.model, modes=finding.modes), sorted(found)
+    """Give each axis errors, warnings, promise and band of the modes."""
+    model, order = replace(chains.model, modes=finding.modes), sorted(chains)
     fitted, unseen = (
         [each_of(free_run(model, record)) for record in records]
         for records in (data.records, data.validation)
@@ -112,7 +112,7 @@ def _with_modes(
         runs = [x[axis] for x in fitted], [x[axis] for x in unseen]
         return _of_modes(chain, *runs, finding, held_out, data.of_chains[axis])
 
-    return EachAxis({a: of_axis(a, x) for a, x in found.items()}, modes=finding.modes)
+    return EachAxis({a: of_axis(a, x) for a, x in chains.items()}, modes=finding.modes)
 
 
 def _of_modes(
@@ -123,7 +123,7 @@ def _of_modes(
     held_out: Mapping[str, float],
     of_chain: Sequence[Record],
 ) -> Identification:
-    """Judge an axis by free runs of the modes, over the records and those for validation."""
+    """Judge an axis by free runs of the modes over records, and over records for validation."""
     scaling, data = chain.model.scaling, prepare(of_chain)
     own = [p for run in fitted for p in _predictions(run, scaling)]
     others = [p for run in unseen for p in _predictions(run, scaling)]
@@ -163,23 +163,23 @@ def _of_modes(
 
 
 def _pieces(run: FreeRun) -> Iterator[tuple[Piece, Array, Mask]]:
-    """Yield each piece, its prediction, and the samples that count: those that `score` rates."""
+    """Yield each piece, its prediction, and the samples that `score` rates."""
     late = run.late if run.errors_after_start is not None else (0,) * len(run.late)
     for piece, y_hat, start in zip(run.record, run.pieces, late, strict=True):
         yield piece, y_hat, piece.mask & (np.arange(piece.n) >= start)
 
 
 def _predictions(run: FreeRun, scaling: Scaling) -> list[Prediction]:
-    name, found = run.record.name, []
+    name, predictions = run.record.name, []
     for piece, y_hat, use in _pieces(run):
         u, x = scaling.u(piece.v), scaling.x(piece.y)
         whole = Run(u=u, x=x, use=use, record=name, piece=piece, known=use)
-        found.append(Prediction(whole, y_hat, np.full(piece.n, np.nan), use))
-    return found
+        predictions.append(Prediction(whole, y_hat, np.full(piece.n, np.nan), use))
+    return predictions
 
 
 def _known(model: StageModel, prediction: Prediction) -> Mask:
-    """Mark the samples that a free run can know: of a piece that begins at rest, all."""
+    """Mark the samples that a free run can know: all samples of a piece that begins at rest."""
     piece = prediction.run.piece
     return piece.mask if is_at_rest(model, piece) else prediction.judged
 
@@ -196,7 +196,7 @@ def _in_fit(run: Run, labels: Collection[str]) -> Mask:
 def _moved_zeros(
     predictions: Sequence[Prediction], scaling: Scaling
 ) -> dict[tuple[str, float], float]:
-    """Compute the distance of the zero of each run from that of the model, if it moved [m]."""
+    """Compute the distance of the zero of each run from the model's zero, if it moved [m]."""
     errors: dict[tuple[str, float], list[Array]] = {}
     for p in predictions:
         e = (p.run.piece.y - p.y_hat)[p.judged]
@@ -208,7 +208,7 @@ def _moved_zeros(
 def _err_elsewhere(
     taken: EachAxis[Identification], chains: EachAxis[Identification], sines: Collection[str]
 ) -> bool:
-    """Tell whether modes err more than chains on segments other than these multisines."""
+    """Return whether modes err more than chains on segments other than these multisines."""
     errors = []
     for axis, result in taken.items():
         ours = [
@@ -231,10 +231,10 @@ def _err_elsewhere(
 def diagnosed_modes(
     model: MultiAxisModel, records: Sequence[Record], settings: DiagnosisSettings
 ) -> EachAxis[Diagnosis]:
-    """Judge a model with shared modes as it is; nothing is searched or fitted."""
+    """Judge a model with shared modes as it is, without search or fit."""
     runs = [each_of(free_run(model, record)) for record in records]
-    found = {a: _judged(x, [run[a] for run in runs], settings) for a, x in model.axes.items()}
-    return EachAxis(found, modes=model.modes)
+    results = {a: _judged(x, [run[a] for run in runs], settings) for a, x in model.axes.items()}
+    return EachAxis(results, modes=model.modes)
 
 
 def _judged(model: StageModel, runs: Sequence[FreeRun], settings: DiagnosisSettings) -> Diagnosis:

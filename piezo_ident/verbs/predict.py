@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Predict a record with a model of one axis or of several."""
+"""Predict a record by a model of one axis or of several axes."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ def free_run(
     """
     Predict a record in free run, and compare it with the measured displacement.
 
-    A record that does not start at rest at the lowest voltage has an unknown memory, which is
-    estimated from its early part.  A model with creep also gets the creep from earlier motion if
-    the early part shows it.  Later samples are predicted without any fit.
+    If a record does not start at rest at the lowest voltage, the unknown memory is estimated from
+    its early part.  A model with creep also gets the creep from earlier motion if the early part
+    shows it.  Later samples are predicted without a fit.
 
     Parameters
     ----------
     model : StageModel or MultiAxisModel
     record : Record
-        Its displacement serves only for this estimate and for the errors.
+        The displacement serves only for this estimate and for the errors.
     interval : float, optional
         Level of a band of the error, for example 0.9; see `piezo_ident.uncertainty.band`.
     axes : collection of str, optional
-        Axes of a model of several that are compared.  Default: all.
+        Axes to compare.  Default: all axes of the model.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Give the prediction of modes that axes share its band."""
+"""Compute the band of a prediction by modes that axes share."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def modes_half_widths(
     """
     Compute the half width of the band of each piece of a record with shared modes, by axis [m].
 
-    `seen` has the record of every axis.  The voltage alone is known.  Where a piece does not start
-    at rest, the band contains all possible plays until the motion has swept them.  The creep from
-    before is always in the band.
+    `seen` has the record of every axis, of which the voltage is used.  For a piece that does not
+    start at rest, the band contains all possible plays until the motion has swept them.  The band
+    always contains the creep of earlier motion.
     """
     each, order = judged_models(model), sorted(model.axes)
-    found: dict[str, list[Array]] = {axis: [] for axis in order}
+    half_widths: dict[str, list[Array]] = {axis: [] for axis in order}
     for i in range(len(seen[order[0]].pieces)):
         pieces = [seen[axis].pieces[i] for axis in order]
         v = np.column_stack([piece.v for piece in pieces])
@@ -42,5 +42,5 @@ def modes_half_widths(
             spread = MemorySpread(modes).follow(v, y)
         for j, axis in enumerate(order):
             band = BandStream(each[axis], level, creep=False)
-            found[axis].append(band.follow(v[:, j], y[:, j]) + level * spread[:, j])
-    return {axis: tuple(half) for axis, half in found.items()}
+            half_widths[axis].append(band.follow(v[:, j], y[:, j]) + level * spread[:, j])
+    return {axis: tuple(half) for axis, half in half_widths.items()}
