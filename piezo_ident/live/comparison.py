@@ -87,8 +87,6 @@ class AxisComparison:
         """Whether the memory of the plays is known, from rest or from sweeps."""
         return self._knows() or self.corrector.knows_memory
 
-    # blocks
-
     def drove(self, v: Array) -> None:
         """Take the next voltages [V], shape (n,), for `room`."""
         numbers, (low, high) = v[np.isfinite(v)], self._ends
@@ -136,8 +134,6 @@ class AxisComparison:
         for pair in pairs:
             left = pair.residual
             self.left.add(left.t, left.values, self.corrector.span, pair.y)
-
-    # once a second
 
     def look(self, is_silent: bool) -> str:
         """

@@ -195,8 +195,6 @@ class SampleClock:
             )
         return t, f'its time stamps are not ticks of {self.sample_rate:g} Hz in a row'
 
-    # publisher of a block
-
     def _is_next(self, sequence: int) -> bool:
         """Return whether a number is next for the followed publisher and for no other."""
         return self._sequence is None or (
@@ -248,8 +246,6 @@ class SampleClock:
         self._is_silent = False
         self._forget()
         self._begin = tick
-
-    # relation to the stream
 
     def _at(self, tick: int) -> str:
         return f'at t = {tick / self.sample_rate:.6g} s'

@@ -121,8 +121,6 @@ class ExcitationNode(LabNode):
         self.offer('start', self._start)
         self.offer('stop', self._stop)
 
-    # parameters
-
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programs that cannot be played, and limits that are crossed."""
         if name not in ('program', 'in_turn', 'voltage_low', 'voltage_high', 'rest'):
@@ -163,8 +161,6 @@ class ExcitationNode(LabNode):
         v = values or self.values
         # a program keeps to its own slew
         return guard_settings({**v, 'slew': math.inf}, v['sample_rate'])
-
-    # services
 
     def _is_playing(self) -> bool:
         thread, playing = self._thread, self._playing
@@ -317,8 +313,6 @@ class ExcitationNode(LabNode):
             start = playing.tick
             self._send(playing, voltages, 'ramp:stop')
             clock.note(start - origin, size, time.monotonic())
-
-    # diagnostics, end
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, blocks, delays and head-room; watch for a second publisher."""

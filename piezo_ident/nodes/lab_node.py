@@ -91,8 +91,6 @@ class LabNode(ParameterNode):
         """Return the suffix of the topics of each axis: '' of the first axis, ``_b`` of axis b."""
         return ['', *(f'_{name}' for name in self.values['axes'] if name)]
 
-    # status, diagnostics, services
-
     def report_status(
         self,
         state: str,

@@ -95,8 +95,6 @@ class ModelNode(LabNode):
         on_message = functools.partial(self._on_block, what, tail)
         return self.create_subscription(Float64MultiArray, f'{what}{tail}', on_message, STREAM)
 
-    # models
-
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a missing model file; ``~/status`` reports faults inside a file."""
         if name == 'adapt' and hasattr(self, '_predictor'):
@@ -164,8 +162,6 @@ class ModelNode(LabNode):
         if not said:
             raise DataError('; '.join(refused))
         return '; '.join(said)
-
-    # blocks
 
     def _on_block(self, what: str, tail: str, message: Float64MultiArray) -> None:
         begin = time.perf_counter()
@@ -262,8 +258,6 @@ class ModelNode(LabNode):
                 message.name += [f'{quantity}/{what}' for what in ('mean', 'min', 'max')]
                 message.position.extend(values)
             self._joints.publish(message)
-
-    # status and diagnostics
 
     def _note_problem(self, problem: str) -> None:
         # a listener may miss a status, so each status names the last few problems

@@ -90,8 +90,6 @@ class PlayerNode(LabNode):
         """Refuse invalid names of topics."""
         return topics_problem(value) if name == 'topics' else None
 
-    # services
-
     def start(self) -> str:
         """
         Replay the bag from its beginning; see ``~/status``.
@@ -272,8 +270,6 @@ class PlayerNode(LabNode):
         level = WARN if early else OK
         parts = [about, *map(str, clock.faults), early]
         self._report('done', '; '.join(filter(None, parts)), level, 100.0)
-
-    # reports
 
     def _numbers(self) -> dict[str, Any]:
         replay = self._replay or Replay('', ())

@@ -85,8 +85,6 @@ class RecorderNode(LabNode):
             return home_problem(value)
         return topics_problem(value) if name == 'topics' else None
 
-    # services
-
     def start(self) -> str:
         """
         Open a bag and record; ``~/status`` says when all publishers are matched.
@@ -216,8 +214,6 @@ class RecorderNode(LabNode):
                 problems = subscriptions.problems
                 about = problems or f'recording to {writer.path}'
                 self._report('recording', about, WARN if problems else OK)
-
-    # reports
 
     def _is_recording(self) -> bool:
         return self._recording is not None and not self._recording.over.is_set()

@@ -147,8 +147,6 @@ class StageNode(LabNode):
     def _is_at_rest(self) -> bool:
         return all(guard.is_at_rest for guard in self._axis_guards)
 
-    # parameters
-
     def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
         return guard_settings(values or self.values, self.sample_rate)
 
@@ -172,8 +170,6 @@ class StageNode(LabNode):
 
     def _watch_period(self) -> float:
         return min(0.05, max(0.005, self.values['silence'] / 4))
-
-    # the stream
 
     def _on_voltage(self, message: Float64MultiArray, info: Mapping[str, Any]) -> None:
         begin = time.perf_counter()
@@ -268,8 +264,6 @@ class StageNode(LabNode):
             self._publish_applied(t, cut, segment)
             self._tick += cut[0].size
 
-    # silence
-
     def _on_watch(self) -> None:
         self._looks.look()
         self._take_complete()
@@ -306,8 +300,6 @@ class StageNode(LabNode):
             self._state = 'idle'
             self._faults.note('silence', 'no voltage: ramped to rest', 0)
         self._report_state()
-
-    # reports
 
     def _report_state(self) -> None:
         faults = self._faults.text

@@ -99,13 +99,9 @@ class IdentifierNode(LabNode):
 
         super().offer(name, drained)
 
-    # capture
-
     def _drain(self) -> None:
         # blocks wait until the excitation has accepted the start, which clears the earlier capture
         self._inputs.drain(hold=self._excitation.is_starting)
-
-    # state
 
     def _set_state(
         self, state: str, progress: float, text: str, level: bytes = OK, **more: Any
@@ -176,8 +172,6 @@ class IdentifierNode(LabNode):
             # some milliseconds; nothing is compiled before a diagnosis
             self._session.take(load(path), {})
             self._published = ''
-
-    # services
 
     def _run(self) -> str:
         self._refuse_when_busy()
@@ -266,8 +260,6 @@ class IdentifierNode(LabNode):
         self._session.forget()
         self._steps = Steps()
 
-    # what the diagnosis session needs
-
     def _diagnose(self) -> str:
         self._refuse_when_busy()
         return f'{self._session.begin()}; see ~/status'
@@ -313,8 +305,6 @@ class IdentifierNode(LabNode):
         self._published = text
         self._model.publish(String(data=text))
 
-    # work
-
     def _progress(self, step: str, share: float) -> None:
         state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
         axes = ['y', *(f'y_{name}' for name in self._axes)]
@@ -358,8 +348,6 @@ class IdentifierNode(LabNode):
             self._session.take_outcome(result)
         else:
             self._set_state('done', 100.0, f'written: {result}')
-
-    # end and diagnostics
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""
