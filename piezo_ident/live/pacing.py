@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 
-#: larger delays are not made up, since readers keep so many blocks [s]
+#: largest delay that is made up, since readers keep only so many blocks [s]
 SLIP = 0.25
 #: smallest jump of a clock that was set; less than the time of a block [ns]
 STEP = 500_000

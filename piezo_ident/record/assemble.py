@@ -44,7 +44,7 @@ VOLTAGE = (1e-12, 1e12)
 LOST = 1e-6
 #: largest share of samples without a number that are cut out
 MAX_NOT_FINITE = 0.01
-#: largest share of displacements without a number, in at most `MAX_NOT_FINITE` n places
+#: largest share of displacements without a number; a share `MAX_NOT_FINITE` limits their places
 MAX_NOT_MEASURED = 0.3
 #: latest time in seconds [s]
 MAX_TIME = 1e11

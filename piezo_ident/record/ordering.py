@@ -35,7 +35,7 @@ from piezo_ident.record.record import Fault
 MIN_STRETCH = 10
 #: largest chance that a rate of so few digits lies within the bounds of rounded stamps
 CHANCE = 0.1
-#: longer rows that start over and equal the old rows are another run [samples]
+#: longest repeat from the beginning that is not another run [rows]
 MAX_REPEAT = 200
 
 

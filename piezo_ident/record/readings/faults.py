@@ -50,8 +50,8 @@ HELD = 2 * JUMP
 CHANCE, CREEPS = 0.01, 3e-5
 #: least number of repeats in a moving signal, and least share of the moving samples
 REPEATS, REPEATED = 4, 2e-4
-#: least share of repeats after which the signal catches up, and level of the test of their number
-#: against pauses of the motion, after which half of the signals catch up by chance
+#: least share of repeats after which the signal catches up; level of the test against pauses of the
+#: motion, after which the signal seems to catch up in half of the cases
 MADE_UP, BY_CHANCE = 0.7, 1e-3
 #: samples that give the step of a converter, and samples of a row of them
 MOST, MOST_ROW = 2**17, 2**10
@@ -59,7 +59,7 @@ MOST, MOST_ROW = 2**17, 2**10
 ROUNDED = 0.07
 #: largest shares of wild readings, and of held and repeated readings, that count as faults
 MAX_WILD, MAX_HELD = 0.15, 0.3
-#: rounds of stroke and wild readings
+#: most rounds that determine stroke and wild readings in turn
 TURNS = 5
 #: least changes of a displacement that give the rate of its sensor
 CHANGES = 100

@@ -27,7 +27,7 @@ FAR, AROUND = 8.0, 16
 WIDTH = 2 * AROUND + 1
 #: least size of a jump in codes of a converter: noise turns two
 CODES = 3.0
-#: a quantile that half of the steps as jumps leave alone, and the median of normal steps over it
+#: quantile of the steps, sound if half of them are jumps; ratio of the median to it without jumps
 QUANTILE = 0.3, 1.75
 #: rms of second over first differences of steps without memory (white noise: 1.73, a sine of five
 #: samples a period: 1.18)
