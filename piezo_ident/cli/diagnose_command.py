@@ -43,20 +43,20 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
         diagnose_each(args, settings, console)
         return
     paths, further = checked(args, Diagnosis, console, args.model_file)
-    given = load(args.model_file)
+    model = load(args.model_file)
     records, validation = read_both(paths, further, args, console)
     for record in validation:
         # a wrong rate is refused before the long work
         with naming(record.name):
             for piece in record:
-                given.check_rate(piece)
+                model.check_rate(piece)
     with (
         naming(str(args.model_file), *(record.name for record in records)),
         console.progress() as progress,
     ):
-        diagnosis = diagnose(given, records, settings, progress=progress)
+        diagnosis = diagnose(model, records, settings, progress=progress)
     diagnosis = validated(diagnosis, validation)
-    of_axes = models_of(given)
+    of_axes = models_of(model)
     diagnosis = mapped(diagnosis, lambda axis, x: _named(x, of_axes[axis], records))
     prompt = prompt_of(args, [*records, *validation], [*paths, *further])
     keep(diagnosis, args, prompt)
@@ -92,15 +92,15 @@ def _changes(diagnosis: Diagnosis | EachAxis[Diagnosis]) -> str:
     return '; '.join(': '.join(text) for text in texts if text[-1])
 
 
-def _named(diagnosis: Diagnosis, given: StageModel, records: Sequence[Record]) -> Diagnosis:
+def _named(diagnosis: Diagnosis, model: StageModel, records: Sequence[Record]) -> Diagnosis:
     """Add warnings about records from which the model may have been identified."""
-    told = _of_names(given, records)
+    told = _of_names(model, records)
     return replace(diagnosis, warnings=(*told, *diagnosis.warnings))
 
 
-def _of_names(given: StageModel, records: Sequence[Record]) -> list[str]:
+def _of_names(model: StageModel, records: Sequence[Record]) -> list[str]:
     """Warn about each record whose name is among the records of the identification."""
-    used = given.identification.get('records')
+    used = model.identification.get('records')
     known = used if isinstance(used, Sequence) else ()
     return [
         f'{record.name}: the model was identified from a record of this name. The error on the '

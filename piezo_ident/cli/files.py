@@ -274,8 +274,8 @@ def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
 def check_apart(output: Path, record: Path) -> None:
     """Refuse an output that is the record, lies in its folder, or contains it."""
     # realpath, because Path.resolve raises its own error for circular links
-    out, given = (Path(os.path.realpath(path)) for path in (output, record))
-    if out == given or out in given.parents or given in out.parents:
+    out, source = (Path(os.path.realpath(path)) for path in (output, record))
+    if out == source or out in source.parents or source in out.parents:
         raise DataError(
             f'{output}: is the input {record}, lies in it or holds it; choose another name'
         )

@@ -28,7 +28,7 @@ from piezo_ident.cli.console import Console
 from piezo_ident.common.errors import did_you_mean, PiezoIdentError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
-#: module of each verb that shares one; any other verb has a module of its own name
+#: modules with several verbs, by verb; any other verb has a module of its own name
 HOMES = {
     **dict.fromkeys(('convert', 'simulate'), 'record'),
     **dict.fromkeys(('predict', 'invert', 'export'), 'model'),
@@ -56,11 +56,11 @@ class Verb(click.Command):
         *examples: str,
     ) -> None:
         self.sections = sections
-        given = [x for section in sections.values() for x in section]
+        flags = [x for section in sections.values() for x in section]
         super().__init__(
             name,
-            params=[*arguments, *given, options.JSON],
-            callback=lambda **given: SimpleNamespace(verb=name, **given),
+            params=[*arguments, *flags, options.JSON],
+            callback=lambda **values: SimpleNamespace(verb=name, **values),
             context_settings=SETTINGS,
             help=text,
             epilog=_examples(examples),
@@ -217,7 +217,7 @@ cli = Verbs(
         click.Command(
             'node',
             params=[options.NODE, options.NODE_ARGUMENTS],
-            callback=lambda **given: SimpleNamespace(verb='node', json=False, **given),
+            callback=lambda **values: SimpleNamespace(verb='node', json=False, **values),
             # the words after the name are for ROS
             context_settings={
                 **SETTINGS,
@@ -266,20 +266,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             # a terminal without micro signs gets question marks instead of a traceback
             if hasattr(stream, 'reconfigure'):
                 stream.reconfigure(errors='replace')
-        given = cli.main(words or ['--help'], 'piezo_ident', standalone_mode=False)
-        if not isinstance(given, SimpleNamespace):  # help or version
-            return int(given or DONE)
+        args = cli.main(words or ['--help'], 'piezo_ident', standalone_mode=False)
+        if not isinstance(args, SimpleNamespace):  # help or version
+            return int(args or DONE)
         if 'numpy' not in sys.modules:
             # the matrices are narrow: a second thread of BLAS saves no time, and slows an
             # identification down eight times on a busy machine
             for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
                 os.environ.setdefault(name, '1')
         # imports the modules of this verb alone
-        home = HOMES.get(given.verb, given.verb)
+        home = HOMES.get(args.verb, args.verb)
         module = importlib.import_module(f'piezo_ident.cli.{home}_command')
-        console = Console(given.json)
+        console = Console(args.json)
         with console.notices():
-            getattr(module, f'{given.verb}_command')(given, console)
+            getattr(module, f'{args.verb}_command')(args, console)
         sys.stdout.flush()
         if argv is None:
             # all is written; an interrupt while the interpreter ends would print a traceback

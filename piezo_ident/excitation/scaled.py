@@ -85,8 +85,8 @@ def program_to_yaml(program: Program) -> str:
     lines.append('segments:')
     for entry in program.entries:
         named = {} if entry.name is None else {'name': entry.name}
-        given = {key: x for key, x in entry.options.items() if x is not None}
-        lines.append(f'  - {_flow({"signal": entry.signal, **named, **given})}')
+        set_options = {key: x for key, x in entry.options.items() if x is not None}
+        lines.append(f'  - {_flow({"signal": entry.signal, **named, **set_options})}')
     return '\n'.join([*lines, ''])
 
 

@@ -178,7 +178,7 @@ def _feedforward(
     if preview is not None:
         Q = Q.shortened(preview)
     # an effect that reads the command has no inverse, as the command is not known yet
-    undone = [link for link in back.links if 'v' not in link.given(link.code.step)]
+    undone = [link for link in back.links if 'v' not in link.signals_in(link.code.step)]
     inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept
     for link in front.links:
@@ -234,7 +234,7 @@ def _says(
     if Q.ahead < ahead:
         lacks.append(f'samples {Q.ahead + 1} to {ahead} ahead, which the filter would also need')
     for link in back.links:
-        if 'v' in link.given(link.code.step):
+        if 'v' in link.signals_in(link.code.step):
             lacks.append(f'{link.name}: the voltage in the reading')
         elif link.effect and is_filter(type(link.effect)) and len(back.links) > 1:
             lacks.append(f'the place of {link.name}: it is undone as if it stood beside G')

@@ -19,7 +19,7 @@ from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
 
 #: signals that the statements of a link may read
-_GIVEN = ('u', 'v', 't', 'c')
+_SIGNALS = ('u', 'v', 't', 'c')
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +41,9 @@ class Link:
         """Members of the struct with its state."""
         return self.code.state.split('\n')[:-1]
 
-    def given(self, text: str) -> list[str]:
-        """List the signals of `_GIVEN` that a text uses."""
-        return [name for name in _GIVEN if name in _words(text)]
+    def signals_in(self, text: str) -> list[str]:
+        """List the signals of `_SIGNALS` that a text uses."""
+        return [name for name in _SIGNALS if name in _words(text)]
 
     def body(self, text: str) -> str:
         """Put definitions of the used numbers in front of a text, without empty lines."""
@@ -57,9 +57,9 @@ class Link:
         text = getattr(self.code, what)
         if not text:
             return ''
-        given = [f'&{state}->{self.tag}'] if self.code.state else []
-        given += ['x', *self.given(text)]
-        return f'x = {prefix}_{self.tag}_{what}({", ".join(given)});'
+        arguments = [f'&{state}->{self.tag}'] if self.code.state else []
+        arguments += ['x', *self.signals_in(text)]
+        return f'x = {prefix}_{self.tag}_{what}({", ".join(arguments)});'
 
 
 @dataclass(frozen=True, eq=False)

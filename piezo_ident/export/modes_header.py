@@ -55,9 +55,9 @@ def export_modes(
         When the name is not allowed in C, or settings of a feed-forward are given.
     """
     checked_name(name)
-    if given := [key for key, x in drive.items() if x is not None and x != math.inf]:
+    if settings := [key for key, x in drive.items() if x is not None and x != math.inf]:
         raise ConfigError(
-            f'export: a header of shared modes has no feed-forward, which {", ".join(given)} '
+            f'export: a header of shared modes has no feed-forward, which {", ".join(settings)} '
             'would set; leave them out'
         )
     order, loop = sorted(model.axes), modes.loop

@@ -77,14 +77,14 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         for role, quantity in (('t', 'time'), ('v', 'voltage'), ('y', 'displacement')):
-            given = getattr(self, f'{quantity}_unit')
-            if given is None:
+            option = getattr(self, f'{quantity}_unit')
+            if option is None:
                 continue
-            unit = scaled_unit(role, given) if isinstance(given, str) else ''
+            unit = scaled_unit(role, option) if isinstance(option, str) else ''
             if not unit:
                 known = [*UNITS[role]]
                 raise DataError(
-                    f'unknown {quantity} unit {given!r}; use {", ".join(known[:-1])} or '
+                    f'unknown {quantity} unit {option!r}; use {", ".join(known[:-1])} or '
                     f'{known[-1]}, or what one of the file is, as in 10{known[-2]}'
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)

@@ -52,7 +52,7 @@ typedef struct {
 {% endif %}
 {% for what in ('rest', 'step') if link.code[what] %}
 static inline double {{ p }}_{{ link.tag }}_{{ what }}({% if link.code.state %}{{ p }}_{{ link.tag }} *s, {% endif %}
-double x{% for name in link.given(link.code[what]) %}, double {{ name }}{% endfor %})
+double x{% for name in link.signals_in(link.code[what]) %}, double {{ name }}{% endfor %})
 {
 {{ link.body(link.code[what]) | indent(4, first=True) }}
     return x;

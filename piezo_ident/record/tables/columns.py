@@ -85,16 +85,16 @@ def choose(
     beside the columns, may hold a sampling rate; `empty` are the places of empty columns.
     DataError for a missing or ambiguous quantity; the message names the option and the file.
     """
-    given = {role: _place(role, name, names, path) for role, name in options.named.items()}
-    for role in given:
+    by_option = {role: _place(role, name, names, path) for role, name in options.named.items()}
+    for role in by_option:
         if role not in ('t', 'v', 'y', 'segment') and not channel_of_column(role):
             raise DataError(f'{path}: --columns {role}: {role[2:]} is a unit; name it otherwise')
     rate, origin = options.rate, '--rate'
-    if rate is not None and 't' in given:
+    if rate is not None and 't' in by_option:
         raise DataError(f'{path}: --rate and a column of time do not go together; drop one')
     wanted = [role for role in 'tvy' if role != 't' or rate is None]
-    exact = [role for role in (*wanted, 'segment') if role not in given]
-    places = given | _exact(exact, names, {*given.values(), *empty}, path)
+    exact = [role for role in (*wanted, 'segment') if role not in by_option]
+    places = by_option | _exact(exact, names, {*by_option.values(), *empty}, path)
     free = [i for i in range(len(names)) if i not in {*places.values(), *empty}]
     guessed = _guessed([role for role in wanted if role not in places], names, free, places, path)
     free = [i for i in free if i not in guessed.values()]
@@ -110,7 +110,7 @@ def choose(
     units = {role: _unit_of(role, places, names, options, path) for role in roles}
     used = set(places.values())
     faults = []
-    if guessed or given or (rate is not None and options.rate is None):
+    if guessed or by_option or (rate is not None and options.rate is None):
         parts = [] if rate is None else [f't is k / {rate:.9g} Hz by {origin}']
         for role in filter(places.__contains__, 'tvy'):
             k = places[role]
@@ -295,24 +295,24 @@ def _unit_of(
     # the unit of the first axis holds for the others
     own = [names[places[r]] for r in (role, first) if r in places]
     name = next((x for x in own if name_and_unit(x)[1]), '')
-    unit, given = name_and_unit(name)[1], options.unit(first) or ''
+    unit, wanted = name_and_unit(name)[1], options.unit(first) or ''
     kind = next((r for r, units in UNITS.items() if unit in units), None)
-    number, plain, of_volts = split_unit(given)
-    if not unit or (given and not kind):
-        return given
+    number, plain, of_volts = split_unit(wanted)
+    if not unit or (wanted and not kind):
+        return wanted
     if number and kind == 'v' and plain != unit:
         # the number of the option is for one volt, also under a header of mV
         return f'{float(number) / UNITS["v"][unit]:.15g}{plain}'
     if number and (kind == 'v' or not of_volts):
-        return given
+        return wanted
     # an axis whose header has a unit of its own keeps it
-    if kind == first and (given in ('', unit) or (role != first and not number)):
+    if kind == first and (wanted in ('', unit) or (role != first and not number)):
         return unit
-    raise _contradiction(first, kind, name, unit, given, path)
+    raise _contradiction(first, kind, name, unit, wanted, path)
 
 
 def _contradiction(
-    role: str, kind: str | None, name: str, unit: str, given: str, path: Path
+    role: str, kind: str | None, name: str, unit: str, wanted: str, path: Path
 ) -> DataError:
     """Return the error for a unit of a header that contradicts the quantity or the option."""
     option = f'--{_QUANTITIES[role]}-unit'
@@ -328,12 +328,12 @@ def _contradiction(
             f'{column}but its unit is of a {_QUANTITIES[kind]}; name another column, or what one '
             f'{one} is, as in {option} {scale}'
         )
-    _, plain, of_volts = split_unit(given)
+    _, plain, of_volts = split_unit(wanted)
     cure = 'leave the option out'
     if not of_volts:
         # how many of the header's unit make one volt
         cure += f', or overrule it by {option} {UNITS["v"].get(unit, 1.0):g}{plain}'
-    return DataError(f'{column}in {unit} by the header, and {option} says {given}; {cure}')
+    return DataError(f'{column}in {unit} by the header, and {option} says {wanted}; {cure}')
 
 
 def _option(role: str, name: str) -> str:
