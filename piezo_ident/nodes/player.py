@@ -291,9 +291,9 @@ def chosen_topics(
     """
     Choose topics of an open bag; return their full names here by their names in the bag.
 
-    A `wanted` topic is found by its full name here, which `resolve` gives by namespace and
-    remaps.  Otherwise it is found by the end of its name, so that a recording of one namespace can
-    be replayed in another.  Otherwise it is found by the quantity that its blocks carry.
+    The full name of a `wanted` topic here, which `resolve` gives, selects the topic of the bag.
+    Without a match the end of the name does, so that a recording of one namespace can be replayed
+    in another namespace; without that the quantity of the blocks.
 
     DataError when a topic is not in the bag, or more than one could be meant.
     """
@@ -326,7 +326,7 @@ def _carried(bag: Bag) -> dict[str, str]:
     try:
         return carried_quantities(bag)
     except DataError:
-        return {}  # a bag without samples: topics are found by name alone
+        return {}  # in a bag without samples, names alone select topics
 
 
 def _profile(connection: Connection) -> QoSProfile:

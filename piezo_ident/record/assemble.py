@@ -129,8 +129,8 @@ def _table(
         raise DataError(f'{name}: columns differ in length ({lengths}); give one value a sample')
     n = columns['t'].size
     if n < 2:
-        found = 'one sample only' if n else 'no samples'
-        raise DataError(f'{name}: {found}; a record needs at least two')
+        content = 'one sample only' if n else 'no samples'
+        raise DataError(f'{name}: {content}; a record needs at least two')
     names, starts = segments if segments is not None else ((), ())
     try:
         rows = np.asarray(starts if len(names) else (), dtype=np.float64).ravel()

@@ -38,10 +38,10 @@ def role_of(channel: str) -> str:
     >>> [role_of(x) for x in ('v_b', 'y_tilt', 'temperature', 'y_um', 'v')]
     ['v', 'y', '', '', '']
     """
-    found = _AXIS.fullmatch(channel)
-    unit = plain_unit(found[2]) if found else ''
+    match = _AXIS.fullmatch(channel)
+    unit = plain_unit(match[2]) if match else ''
     is_unit = unit != 'min' and any(unit in units for units in UNITS.values())
-    return '' if found is None or is_unit else found[1]
+    return '' if match is None or is_unit else match[1]
 
 
 def column_of(channel: str) -> str:

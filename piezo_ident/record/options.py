@@ -157,8 +157,8 @@ def split_unit(text: str) -> tuple[str, str, bool]:
     >>> split_unit('10 \u00b5m/V'), split_unit('sec'), split_unit('')
     (('10', 'um', True), ('', 's', False), ('', '', False))
     """
-    found = _SCALED.fullmatch(text.strip())
-    return (found[1], plain_unit(found[2]), bool(found[3])) if found else ('', '', False)
+    match = _SCALED.fullmatch(text.strip())
+    return (match[1], plain_unit(match[2]), bool(match[3])) if match else ('', '', False)
 
 
 def unit_factor(role: str, unit: str) -> float:
@@ -181,16 +181,16 @@ def name_and_unit(name: str) -> tuple[str, str]:
     """
     # the name of a field without its struct, or of a channel without its group
     name = re.sub(PATH, '', name.strip())
-    found = _NAMED.fullmatch(name)
-    if not found:
+    match = _NAMED.fullmatch(name)
+    if not match:
         return name, ''
-    unit = plain_unit(next((found[k] for k in 'abcd' if found[k] is not None), ''))
+    unit = plain_unit(next((match[k] for k in 'abcd' if match[k] is not None), ''))
     known = any(unit in units for units in UNITS.values())
-    if found['bare'] is not None:
+    if match['bare'] is not None:
         # v_min is no time
-        return (found['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
+        return (match['bare'].strip(' _.'), unit) if known and unit != 'min' else (name, '')
     # a text in square brackets is a unit, known or not
-    return (found['name'], unit) if known or found['a'] is not None else (name, '')
+    return (match['name'], unit) if known or match['a'] is not None else (name, '')
 
 
 #: least number before a unit, and the inverse of the largest

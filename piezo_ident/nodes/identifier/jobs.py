@@ -185,8 +185,8 @@ def identify_capture(
             _sentence(step), report=json.dumps(data), warnings=len(record.faults), steps=step
         )
     if axes:
-        found = identify(records, settings, progress=tick)
-        return _identified(mapped(found, functools.partial(_with_sign, before)))
+        each = identify(records, settings, progress=tick)
+        return _identified(mapped(each, functools.partial(_with_sign, before)))
     known = (steps or Steps()) if which == 'hysteresis' else None
     one = identify_axis(records, settings, steps=known, progress=tick)
     one = _with_sign(before, 'y', one)

@@ -167,14 +167,14 @@ def ordered_bag(path: str | Path, look: Callable[[Bag], tuple[int, T]]) -> Itera
     """
     with ExitStack() as stack:
         bag = stack.enter_context(opened_bag(path))
-        back, found = look(bag)
+        back, value = look(bag)
         if back:
             with suppress(DataError):
                 other = stack.enter_context(opened_bag(path, in_file_order=True))
                 fewer, again = look(other)
                 if fewer < back and not other.faults:
-                    bag, found = other, again
-        yield bag, found
+                    bag, value = other, again
+        yield bag, value
 
 
 class LogClock:

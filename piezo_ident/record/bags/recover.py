@@ -84,8 +84,8 @@ def storage_of(path: Path) -> str:
     >>> [storage_of(Path(x)) for x in ('a.mcap', 'a_0.db3.zstd', 'a.csv')]
     ['.mcap', '.db3', '']
     """
-    found = _BAG_FILE.fullmatch(path.name)
-    return found['storage'].lower() if found else ''
+    match = _BAG_FILE.fullmatch(path.name)
+    return match['storage'].lower() if match else ''
 
 
 #: arguments of `damage_as_data_error` for bags
@@ -228,10 +228,10 @@ def unpacked(messages: Iterable[Stored], path: Path) -> Iterator[Stored]:
 
 def _unpacked_file(file: Path, stack: ExitStack) -> Path:
     """Unpack a compressed file into a copy, and return the copy; return any other file itself."""
-    found = _BAG_FILE.fullmatch(file.name)
-    if found is None or found['name'] == file.name:
+    match = _BAG_FILE.fullmatch(file.name)
+    if match is None or match['name'] == file.name:
         return file
-    copy = _work_folder(stack) / found['name']
+    copy = _work_folder(stack) / match['name']
     try:
         with file.open('rb') as source, copy.open('wb') as target:
             zstd = library('zstandard', file).ZstdDecompressor()

@@ -126,9 +126,9 @@ def _without_own_faults(record: Record) -> Record:
         rest = replace(piece, y=interpolated(piece.y, bad))
         lost, stuck = bad & (piece.y == 0.0), _held(rest, stroke, span) & ~bad
         kinds = lost, bad & ~lost, stuck, _repeated(rest.y, bad | stuck)
-        for found, mask in zip(masks.values(), kinds, strict=True):
-            found.append(mask)
-    counts = {name: sum(int(mask.sum()) for mask in found) for name, found in masks.items()}
+        for each, mask in zip(masks.values(), kinds, strict=True):
+            each.append(mask)
+    counts = {name: sum(int(mask.sum()) for mask in each) for name, each in masks.items()}
     wilds, hangs = counts['lost'] + counts['outliers'], counts['stuck'] + counts['missed_samples']
     is_way = hangs > MAX_HELD * record.n or wilds > MAX_WILD * record.n
     if is_way or not wilds + hangs:
@@ -136,10 +136,8 @@ def _without_own_faults(record: Record) -> Record:
     bads = (np.logical_or.reduce(kinds) for kinds in zip(*masks.values(), strict=True))
     pieces = tuple(_masked(p, bad, span) for p, bad in zip(record, bads, strict=True))
     faults = []
-    for name, found in masks.items():
-        firsts = [
-            (p, a) for p, mask in zip(record, found, strict=True) for a, _ in true_runs(mask)
-        ]
+    for name, each in masks.items():
+        firsts = [(p, a) for p, mask in zip(record, each, strict=True) for a, _ in true_runs(mask)]
         where = at_times(np.array([float(p.time(a, a + 1)[0]) for p, a in firsts]))
         what = {'stuck': 'the sensor hangs, ', 'missed_samples': 'repeat the reading before, '}
         action = f'{what.get(name, "")}left out of every fit and error; the voltage is kept'
@@ -204,11 +202,11 @@ def _held(piece: Piece, stroke: float, span: float) -> Mask:
     Without noise, backlash may hold readings.
     """
     y, v = piece.y, piece.v
-    found = np.zeros(y.size, dtype=bool)
+    marked = np.zeros(y.size, dtype=bool)
     # a slow sensor holds every reading
     runs = [(a, b) for a, b in constant(y, HELD * period_of(y)) if a > 0 and b < piece.n]
     if not runs or not span:
-        return found
+        return marked
     floor = least_jump(y, stroke)
     ends = float(y.min()), float(y.max())
     trembles = _trembles(y)
@@ -225,8 +223,8 @@ def _held(piece: Piece, stroke: float, span: float) -> Mask:
             hangs |= b - a >= STUCK and reach > FIRM and 0.3 * reach * stroke > floor
         if hangs:
             # the first reading of a run is good, unless it jumped there
-            found[a if abs(entry) > least else a + 1 : b] = True
-    return found
+            marked[a if abs(entry) > least else a + 1 : b] = True
+    return marked
 
 
 def _trembles(y: Array) -> bool:
@@ -248,10 +246,10 @@ def _repeated(y: Array, known: Mask) -> Mask:
     The neighbours are the readings before and after the equal ones.
     """
     n = y.size
-    found = np.zeros(n, dtype=bool)
+    marked = np.zeros(n, dtype=bool)
     stroke, q = float(np.ptp(y)), quantum_of(y)
     if n < WINDOW or stroke == 0.0 or period_of(y) > 1:
-        return found
+        return marked
     # third differences leave little of smooth motion
     sigma = max(white_noise(np.diff(y, 3), q), 1e-12 * stroke)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(y) != 0.0) + 1, [n]])
@@ -280,9 +278,9 @@ def _repeated(y: Array, known: Mask) -> Mask:
         pauses = int(np.count_nonzero(equal))
         if made >= MADE_UP * pauses and bdtrc(made - 1, pauses, 0.5) < BY_CHANCE:
             for a, b in zip(start[equal], stop[equal], strict=True):
-                found[a + 1 : b] = True
-            return found
-    return found
+                marked[a + 1 : b] = True
+            return marked
+    return marked
 
 
 def white_noise(third: Array, quantum: float) -> float:

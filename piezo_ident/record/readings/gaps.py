@@ -127,15 +127,15 @@ def _joined(pieces: list[Piece]) -> Bridged:
 
 def _segments(pieces: list[Piece], starts: list[int]) -> tuple[Segment, ...]:
     """Return the segments on the joined clock; a gap does not end a segment."""
-    found: list[Segment] = []
+    segments: list[Segment] = []
     end = 0
     for piece, start in zip(pieces, starts, strict=True):
         for s in piece.segments:
             moved = Segment(s.label, s.start + start, s.stop + start)
-            goes_on = s.start == 0 and found and found[-1].stop == end and start > 0
-            if goes_on and found[-1].label == s.label:
-                found[-1] = Segment(s.label, found[-1].start, moved.stop)
+            goes_on = s.start == 0 and segments and segments[-1].stop == end and start > 0
+            if goes_on and segments[-1].label == s.label:
+                segments[-1] = Segment(s.label, segments[-1].start, moved.stop)
             else:
-                found.append(moved)
+                segments.append(moved)
         end = start + piece.n
-    return tuple(found)
+    return tuple(segments)

@@ -69,13 +69,13 @@ def line_error(pieces: Iterable[Piece]) -> float:
 
 def misspelt(labels: Sequence[str]) -> list[str]:
     """Return 'x (did you mean y?)' for every label that is nearly a segment kind."""
-    found = []
+    texts = []
     for label in labels:
         kind = label.partition(':')[0]
         close = difflib.get_close_matches(kind.strip().lower(), KINDS, n=1, cutoff=0.75)
         if kind not in KINDS and close:
-            found.append(f'{label} (did you mean {close[0]}?)')
-    return found
+            texts.append(f'{label} (did you mean {close[0]}?)')
+    return texts
 
 
 def suspicions(record: Record) -> list[str]:

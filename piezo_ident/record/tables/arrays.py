@@ -209,16 +209,16 @@ def _table(
         known = {**scalars, **dict(zip(['wf_increment'], period, strict=False))}
         return choose(candidates, options, path, scalars=known)
 
-    found, table = chosen([*periods.values()])
+    indices, table = chosen([*periods.values()])
     if periods and table.rate is not None and options.rate is None:
         # another channel may have been sampled at another rate
-        named = [candidates[found[role]] for role in 'vy' if role in found]
+        named = [candidates[indices[role]] for role in 'vy' if role in indices]
         steps = sorted({periods[name] for name in named if name in periods})
         if len(steps) > 1:
             text = ' and '.join(f'{x:g} s' for x in steps)
             raise DataError(f'{path}: v and y are sampled every {text}; {_SLOWER}')
-        found, table = chosen(steps)
-    places = {role: candidates[place] for role, place in found.items()}
+        indices, table = chosen(steps)
+    places = {role: candidates[place] for role, place in indices.items()}
     columns = {r: _column(k, numbers[k], path) for r, k in places.items() if r != 'segment'}
     lengths = {places[role]: x.size for role, x in columns.items()}
     if len(set(lengths.values())) > 1:

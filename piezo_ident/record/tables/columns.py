@@ -159,11 +159,11 @@ def _guessed(
             # v [V] beside v_b [V]
             fitting = bare
         if len(fitting) > 1:
-            found = [names[i] for i in fitting]
+            titles = [names[i] for i in fitting]
             # numbers distinguish equal names
-            ways = found if len({*found}) == len(found) else [str(i + 1) for i in fitting]
+            ways = titles if len({*titles}) == len(titles) else [str(i + 1) for i in fitting]
             first, second = (_option(role, way) for way in ways[:2])
-            fault = f'{len(found)} columns may be the {_QUANTITIES[role]} ({listed(found)})'
+            fault = f'{len(titles)} columns may be the {_QUANTITIES[role]} ({listed(titles)})'
             raise DataError(f'{path}: {fault}; say which: {first} or {second}', options=first)
         guessed.update((role, i) for i in fitting)
     return guessed
@@ -224,8 +224,8 @@ def _place(role: str, wanted: str, names: Sequence[str], path: Path) -> int:
 
 def _group(name: str) -> str:
     """Return the struct or group of a column."""
-    found = re.match(PATH, name)
-    return found[0] if found else ''
+    match = re.match(PATH, name)
+    return match[0] if match else ''
 
 
 def words_of(name: str) -> tuple[str, ...]:
@@ -347,18 +347,18 @@ def _missing(
     likely = ('', *UNITS['v'], *UNITS['y'])
     fit = [i for i in free if 't' in missing or name_and_unit(names[i])[1] in likely] or free
     ways = [names[i] or str(i + 1) for i in fit]
-    found = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
+    fault = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
     further = ''
     if missing == ['t']:
         further = f', or the column of time: {_option("t", ways[0])}' if ways else ''
-        return DataError(f'{found}; give the sampling rate, as in {rate}{further}', options=rate)
+        return DataError(f'{fault}; give the sampling rate, as in {rate}{further}', options=rate)
     if len(ways) < len(missing) and missing[0] == 't':
         # not enough columns for time too
         missing, further = missing[1:], f' {rate}'
     if len(ways) < len(missing):
-        return DataError(f'{found}; add a column named {missing[-1]} to the file')
+        return DataError(f'{fault}; add a column named {missing[-1]} to the file')
     # an example that can be typed
     pairs = ','.join(f'{role}={name}' for role, name in zip(missing, ways, strict=False))
     options = f'--columns {shlex.quote(pairs)}{further}'
     either = f', or without a column of time {rate}' if 't' in missing else ''
-    return DataError(f'{found}; name the columns, as in {options}{either}', options=options)
+    return DataError(f'{fault}; name the columns, as in {options}{either}', options=options)

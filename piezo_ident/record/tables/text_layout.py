@@ -141,9 +141,9 @@ def _above(
     numbers = dict(filter(None, (_alone(lines[i], separator) for i in filled)))
     for j, (name, unit) in enumerate(zip(names, [*units, *[''] * len(names)], strict=False)):
         # oscilloscopes write numbers beside the columns: Increment over 1e-3, or tInc = 1e-3
-        found = _alone(f'{name}={unit}' if is_number(unit) else name, separator)
-        if found and j in empty:
-            numbers |= [found]
+        alone = _alone(f'{name}={unit}' if is_number(unit) else name, separator)
+        if alone and j in empty:
+            numbers |= [alone]
             names[j] = ''
         elif unit and name:
             names[j] = f'{name} [{unit.strip("[]()")}]'
@@ -162,12 +162,12 @@ def _as_wide(names: list[str], row: Sequence[str]) -> list[str]:
 def _alone(line: str, separator: str | None) -> tuple[str, float] | None:
     """Return the name, with its unit, of the only number in a line, and the number."""
     digits = _DIGITS.replace('[.,]', '[.]') if separator == ',' else _DIGITS
-    found = re.fullmatch(_ALONE.format(digits), line.strip().replace('"', ''))
-    if not found:
+    match = re.fullmatch(_ALONE.format(digits), line.strip().replace('"', ''))
+    if not match:
         return None
-    unit = found['unit'] or (found['cell'] if _is_unit(found['cell'] or '') else '')
-    name = f'{found["name"]} [{unit}]' if unit else found['name']
-    return name, float(found['value'].replace(',', '.'))
+    unit = match['unit'] or (match['cell'] if _is_unit(match['cell'] or '') else '')
+    name = f'{match["name"]} [{unit}]' if unit else match['name']
+    return name, float(match['value'].replace(',', '.'))
 
 
 def _named(line: str, separator: str | None, need: int) -> list[str]:

@@ -156,10 +156,10 @@ class _Stamps:
         self._last = 0
 
     def __call__(self, text: str) -> float:
-        found = _STAMP.fullmatch(text.strip())
-        if not found:
+        match = _STAMP.fullmatch(text.strip())
+        if not match:
             raise ValueError
-        day, clock, decimals, sign, hours, minutes = found.groups()
+        day, clock, decimals, sign, hours, minutes = match.groups()
         zone = 60 * int(f'{sign}1') * (60 * int(hours) + int(minutes or 0)) if sign else 0
         # counted in ns: a float64 holds a tenth of a microsecond since 1970
         at = (_second(day or '1970-01-01', clock) - zone) * 10**9 + int(f'{decimals or 0:0<9}')
