@@ -169,7 +169,7 @@ class _Topic:
     losses: LossCount = field(default_factory=LossCount)
     taken: int = 0
     problem: str = ''
-    #: publishers, and whether the last two looks found the same single publisher
+    #: publishers, and whether the last two looks saw the same single publisher
     publishers: frozenset[bytes] = frozenset()
     is_single: bool = False
     #: whether the last message came from the only publisher since

@@ -142,37 +142,38 @@ def invert(
     goals = _goals(model, wanted)
     if model.modes is not None:
         return _driven(model, invert_modes(model, model.modes, goals, **options), channels)
-    moved, found = dict(goals), dict[str, Inverse]()
+    moved, inverses = dict(goals), dict[str, Inverse]()
     for _ in range(ROUNDS):
-        last, found = found, {}
+        last, inverses = inverses, {}
         for axis, x in model.axes.items():
             others = {motion_of(k): m for k, m in moved.items() if k != axis}
             beside = {**(channels or {}), **others}
-            found[axis] = invert_axis(x, goals[axis], channels=beside, **options)
-        for axis, one in found.items():
+            inverses[axis] = invert_axis(x, goals[axis], channels=beside, **options)
+        for axis, one in inverses.items():
             y = model.own(axis).simulate(one.v, channels=_led(channels, one.lead))
             moved[axis] = y[one.lead :]
-        if last and all(_alike(last[k], found[k], model.axes[k].scaling.V) for k in found):
+        if last and all(_alike(last[k], inverses[k], model.axes[k].scaling.V) for k in inverses):
             break
-    return _driven(model, found, channels)
+    return _driven(model, inverses, channels)
 
 
 def _driven(
     model: MultiAxisModel,
-    found: Mapping[str, Inverse],
+    inverses: Mapping[str, Inverse],
     channels: Mapping[str, ArrayLike] | None,
 ) -> MultiAxisInverse:
     """Run the whole model under the voltages of the axes, from one common beginning."""
-    lead = max(one.lead for one in found.values())
+    lead = max(one.lead for one in inverses.values())
     v = {
-        voltage_of(k): np.pad(one.v, (lead - one.lead, 0), mode='edge') for k, one in found.items()
+        voltage_of(k): np.pad(one.v, (lead - one.lead, 0), mode='edge')
+        for k, one in inverses.items()
     }
     predicted = model.simulate(v, channels=_led(channels, lead))
     errors = {}
-    for k, one in found.items():
+    for k, one in inverses.items():
         goal, whole = one.wanted[one.lead :], abs(model.axes[k].scaling.Y)
         errors[k] = percent_of_stroke(goal, predicted[k][lead:], None if np.ptp(goal) else whole)
-    return MultiAxisInverse(found, v, predicted, lead, errors)
+    return MultiAxisInverse(inverses, v, predicted, lead, errors)
 
 
 def _goals(model: MultiAxisModel, wanted: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Array]:
