@@ -5,9 +5,8 @@
 Learn a repeated motion of all axes of a stage.
 
 Each axis corrects its reference by its own error, as `piezo_ident.control.learning` does.  Chains
-are inverted one by one; the motions of the other axes are known, those along the wanted motion,
-which all come near to from run to run.  Modes that the axes share are inverted for the references
-of all axes together.
+are inverted one by one, with the wanted motions of the other axes, which the axes approach from
+run to run.  Modes that the axes share are inverted for the references of all axes together.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class AxesLearning:
     """
     A repeated motion of all axes, learned from run to run.
 
-    An axis that stands still comes as near to its place as the limits allow.
+    A resting axis comes as near to its place as the limits allow.
 
     Parameters
     ----------
@@ -44,7 +43,7 @@ class AxesLearning:
     Attributes
     ----------
     each : dict of str to Learning
-        By the names of the axes.
+        Learning of each axis.
 
     Raises
     ------
@@ -85,7 +84,7 @@ class AxesLearning:
         Raises
         ------
         DataError
-            As `Learning.take`; the axes before that one have learnt.
+            As `Learning.take`; the axes before the refused axis have learnt.
         """
         try:
             for axis, y in measured.items():
@@ -98,7 +97,7 @@ class AxesLearning:
             raise DataError(f'{axis}: {error}') from error
         finally:
             if self._shared is not None:
-                # a correction may go beyond a limit although the motion does not
+                # a corrected reference may exceed a limit although the motion does not
                 references = {axis: one.reference for axis, one in self.each.items()}
                 drives = invert(self._shared, references, clip=True, **self._options)
                 for axis, drive in drives.items():
@@ -106,7 +105,7 @@ class AxesLearning:
 
 
 def _check_reach(drive: Inverse) -> None:
-    """Refuse a moving axis that was clipped for the sake of one that stands still."""
+    """Raise DataError for a moving axis out of reach; clipping is for resting axes alone."""
     missed = np.abs(drive.wanted - drive.predicted)[drive.clipped]
     span = float(np.ptp(drive.wanted[drive.lead :]))
     if span and missed.size and missed.max() > SLIGHT * span:
