@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
+from piezo_ident.control.axes.live_axes import LiveChains
+from piezo_ident.control.axes.live_modes import LiveModesInverse
 from piezo_ident.control.inputs import FAR
-from piezo_ident.control.live_axes import LiveChains
 from piezo_ident.control.live_inverse import PREVIEW
-from piezo_ident.control.live_modes import LiveModesInverse
 from piezo_ident.live.axis_drive import AxisDrive, check_rate, Drive, inverse_of, Successor
 from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import GuardSettings

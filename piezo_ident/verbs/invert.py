@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError
+from piezo_ident.control.axes.modes_inverse import invert_modes
 from piezo_ident.control.inputs import checked_motion
 from piezo_ident.control.inverse import Inverse
 from piezo_ident.control.inverse import invert as invert_axis
-from piezo_ident.control.modes_inverse import invert_modes
 from piezo_ident.model.axis_records import motion_of, voltage_of
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel

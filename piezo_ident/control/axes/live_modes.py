@@ -7,8 +7,8 @@ Invert modes that several axes share, block by block while the wanted motions co
     u <- u + Q (y_wanted - y(u)),        u = u_rest before the first pass
 
 y(u) is the free run of the modes about their `v0`.  Q inverts a linear model of them by filters
-that look ahead, see `piezo_ident.control.axes_inverse`.  As in `piezo_ident.control.live_inverse`,
-each pass runs behind the pass before it, and handles every sample once.
+that look ahead, see `axes_inverse`.  As in `piezo_ident.control.live_inverse`, each pass runs
+behind the pass before it, and handles every sample once.
 
 The linear model leaves out softening and plays, or it has the gain of each signal in a trial run
 over the range.  The one with the smaller error on the trial is taken.  An axis whose voltage is at
@@ -23,11 +23,11 @@ from dataclasses import dataclass
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.control.axes_inverse import AxesFilter, inverse_filters, static_gain
+from piezo_ident.control.axes.axes_inverse import AxesFilter, inverse_filters, static_gain
+from piezo_ident.control.axes.modes_inverse import equivalent, Limited, signal_gains
 from piezo_ident.control.inputs import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import least_gain
 from piezo_ident.control.live_inverse import Driven, LARGE, PREVIEW, trial_motion, WORTH
-from piezo_ident.control.modes_inverse import equivalent, Limited, signal_gains
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.modes.stream import ModesRun, ModesStream

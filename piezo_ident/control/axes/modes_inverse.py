@@ -7,7 +7,7 @@ Invert modes that several axes share: find voltages that move all axes along wan
     m <- m + P (y_wanted - y(u)),        u = u_0 + Q m
 
 y(u) is the free run of the modes.  Q inverts a linear model of them by filters that look ahead,
-see `piezo_ident.control.axes_inverse`.  P = G Q is nearly one where the stage moves, and small
+see `axes_inverse`.  P = G Q is nearly one where the stage moves, and small
 above its modes.  The iteration therefore leaves alone the motion that is too fast for the stage.
 
 A linear model lacks softening and plays.  The first pass inverts the linear model without them,
@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import DataError, ModelError
-from piezo_ident.control.axes_inverse import AxesFilter, inverse_filters, static_gain
+from piezo_ident.control.axes.axes_inverse import AxesFilter, inverse_filters, static_gain
 from piezo_ident.control.expectation import expect
 from piezo_ident.control.inputs import check_rate, checked_limits, extrapolated, tolerance
 from piezo_ident.control.inverse import Inverse, LARGE, MATTERS, RESTS, STANDS, STILL

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.control.live_modes import LiveModesInverse
+from piezo_ident.control.axes.live_modes import LiveModesInverse
 from piezo_ident.model.modes.stream import ModesStream
 import pytest
 from random_models import random_modes_model, random_voltages
