@@ -144,17 +144,25 @@ def test_an_excitation_that_is_killed_before_its_first_block(lab):
     # so that it waits for somebody who never comes
     assert lab.set('excitation', 'subscribers', 9)[0]
     before = len(lab.statuses('excitation'))
-    seen = run(lab, HIGH)
-    # on a busy machine the run may have ended when this is looked at
-    lab.until('excitation', 'waiting', since=before)
-    excitation.kill()
     try:
+        seen = run(lab, HIGH)
+        # on a busy machine the run may end before the excitation has answered
+        lab.wait(
+            lambda: (
+                any(s['state'] == 'waiting' for s in lab.statuses('excitation')[before:])
+                or any(s['state'] == 'failed' for s in lab.statuses('identifier')[seen:])
+            ),
+            'the excitation to wait',
+        )
+        excitation.kill()
         # with its answer, or before it
         reason = ended(lab, seen, 'failed')
         assert re.search('no status of the excitation for 2 s|not respond within 2 s', reason), (
             reason
         )
     finally:
+        if not excitation.is_ended:
+            excitation.kill()
         lab.restart(excitation)
         assert lab.set('identifier', 'excitation_limit', 20.0)[0]
 

@@ -178,7 +178,8 @@ def test_layouts_show_what_was_recorded(whole):
 def test_topics_are_those_of_the_table(whole):
     of_one = [t for t in TOPICS if t.publishers != {'every node'}]
     assert whole.set('excitation', 'program', HIGH)[0]
-    assert whole.call('excitation/start')[0]
+    ok, reason = whole.call('excitation/start')
+    assert ok, reason
     for t in of_one:
         always = {name for name in t.publishers if (t.name, name) not in NOW_AND_THEN}
         wanted = always, set(t.subscribers)
