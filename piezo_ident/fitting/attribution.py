@@ -27,8 +27,8 @@ from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.observer import PATH
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.operators.sections import run_sections
 from piezo_ident.record.readings.faults import MAX_WILD
-from scipy.signal import lfilter
 
 #: time constant with which old samples fade [s] (taste: some periods of a slow scan)
 FADE = 5.0
@@ -170,8 +170,10 @@ class Attribution:
         keep = np.exp(-1.0 / (SLOW * self._rate))
         if self._fast is None:
             # the output of the high-pass begins at zero
-            self._fast = -keep * rows[:, :1]
-        fast, self._fast = lfilter([keep, -keep], [1.0, -keep], rows, axis=1, zi=self._fast)
+            self._fast = np.stack([-keep * rows[:, :1], np.zeros((len(rows), 1))], axis=-1)
+        fast = np.empty_like(rows)
+        for row, state, out in zip(rows, self._fast, fast, strict=True):
+            run_sections(row, np.array([[keep, -keep, 0.0, -keep, 0.0]]), state, out)
         fast, x = fast[:, counts], rows[0, counts]
         left = np.exp(-rows.shape[1] / (FADE * self._rate))
         self._products = left * self._products + fast @ fast.T
