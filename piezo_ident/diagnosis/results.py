@@ -22,6 +22,9 @@ FORMULA = (
     'model as it was given; after: each kind of motion with the parameters fitted to the others'
 )
 
+#: changes of a model that are no effects of the catalogue
+UNNAMED = REFITTED, RETUNED = 'refitted H', 'retuned G'
+
 
 @dataclass(frozen=True)
 class DiagnosisSettings:
@@ -258,8 +261,9 @@ class Diagnosis(Showable):
         Share of the samples whose voltage lies outside the range of the given model.
     held_out : Errors or None
         Errors of the refined model on blocks that were held out in turn, as `after`.
-    errors_of_sets : mapping of tuple of str to float
-        Error beyond the noise that the best candidate of each set of effects leaves, % of stroke.
+    errors_of_sets : mapping of tuple of str to tuple of float
+        Errors that the best candidate of each set of effects leaves on the kinds of motion held
+        out, less most of the noise, % of stroke.  A set ends with its changes of `UNNAMED`.
     promise : Promise or None
     weights : mapping of str to float
         Weight of each set of effects, joined by ``+``, and of ``none of these``; the sum is one.
@@ -305,7 +309,7 @@ class Diagnosis(Showable):
     set_in: bool = False
     outside: float = 0.0
     held_out: Errors | None = None
-    errors_of_sets: Mapping[tuple[str, ...], float] = field(default_factory=dict)
+    errors_of_sets: Mapping[tuple[str, ...], tuple[float, ...]] = field(default_factory=dict)
     promise: Promise | None = None
     weights: Mapping[str, float] = field(default_factory=dict)
 

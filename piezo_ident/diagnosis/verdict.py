@@ -23,7 +23,8 @@ from piezo_ident.diagnosis.criteria import (
     SWALLOWED,
     TAKES,
 )
-from piezo_ident.diagnosis.decision import Candidates, Decision, FittedSet
+from piezo_ident.diagnosis.decision import Candidates, change_g, Decision, FittedSet
+from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes, separating_experiment
 from piezo_ident.diagnosis.refits import WalkStep
 from piezo_ident.diagnosis.results import (
@@ -31,7 +32,10 @@ from piezo_ident.diagnosis.results import (
     Class,
     DiagnosisSettings,
     OtherGain,
+    REFITTED,
+    RETUNED,
     Unexplained,
+    UNNAMED,
     Untestable,
 )
 from piezo_ident.diagnosis.search import gains_of, Round
@@ -258,10 +262,21 @@ def untestable_of(
     )
 
 
-def errors_of_sets(candidates: Candidates) -> Mapping[tuple[str, ...], float]:
-    """Compute the error less the noise that each set of effects leaves, % of stroke."""
-    bests = ((s, candidates.best(s)) for s in candidates.sets)
-    return {s: candidates.rows.percent(candidates.left(c)) for s, c in bests if c is not None}
+def errors_of_sets(candidates: Candidates) -> Mapping[tuple[str, ...], tuple[float, ...]]:
+    """Compute the error of each set of changes on each kind of motion held out, % of stroke."""
+    rows, bests = candidates.rows, dict[tuple[str, ...], Fitted]()
+    size = np.bincount(rows.group[rows.block])
+    for c in sorted(candidates.all, key=candidates.left):
+        has = {REFITTED: c.way != 'given', RETUNED: c.retunes}
+        # a change of G has no retuned G beside it
+        if not (c.retunes and change_g(c.effects)):
+            bests.setdefault((*c.effects, *(name for name in UNNAMED if has[name])), c.fitted)
+    found = {}
+    for changes, one in bests.items():
+        blocks, kinds = (np.bincount(rows.group, e) for e in (one.errors, one.transfer))
+        squares = np.sqrt(blocks * kinds) / size
+        found[changes] = tuple(rows.percent(candidates.beyond_noise(x)) for x in squares)
+    return found
 
 
 def errors_of_laws(candidates: Candidates) -> Mapping[str, float]:

@@ -232,7 +232,7 @@ def _weight_tables(result: Diagnosis) -> list[Table]:
         for name, w in result.weights.items()
         if w >= LEAST_WEIGHT or name == NOTHING
     ]
-    note = f'From kinds of motion held out; the prior of {NOTHING} is {share_text(NONE)}.'
+    note = f'From kinds of motion held out; the prior of no change is {share_text(NONE)}.'
     return table('Weight of each cause', ('cause', 'weight', ''), rows, note)
 
 

@@ -57,7 +57,7 @@ def promised_identification(result: Identification, judged: Judged) -> Identific
 def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     """Add weights, promise and band to a diagnosis, and the promise to its sentence."""
     model = result.model
-    result = replace(result, weights=weights_of(result.errors_of_sets, len(result.kinds)))
+    result = replace(result, weights=weights_of(result.errors_of_sets))
     runs, fit, stroke = _elsewhere(result), result.runs, result.stroke
     same, other = (
         blocks_of(model, runs, excess(fit, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))

@@ -9,7 +9,7 @@ import functools
 import numpy as np
 from paper_stage import FS, PAPER
 from piezo_ident import report
-from piezo_ident.diagnosis.results import DiagnosisSettings
+from piezo_ident.diagnosis.results import DiagnosisSettings, REFITTED
 from piezo_ident.identification.results import Settings
 from piezo_ident.record.record import Piece, Record, Segment
 from piezo_ident.selection.judged import Judged, JudgedRun, Promise
@@ -65,6 +65,15 @@ def test_promise_and_weights_are_in_the_json_and_the_page():
     assert 'none of these' in report.to_json(diagnosis(0.0))['weights']
     text = ' '.join(report.diagnosis_text(result).split())
     assert result.promise.told in text and '█' in text
+
+
+def test_every_set_of_changes_has_an_error_of_each_kind():
+    errors = diagnosis(0.0).errors_of_sets
+    assert {(), (REFITTED,)} <= set(errors)
+    kinds = {len(own) for own in errors.values()}
+    assert len(kinds) == 1 and kinds.pop() > 2
+    # nothing is missing, so a tenth of the noise, 2e-9 of a stroke of 1e-5, is left
+    assert 0.0 < max(errors[()]) < 0.05
 
 
 def test_an_identification_promises_what_the_next_record_shows():
