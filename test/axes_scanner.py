@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.live.predictor import AxesRun
+from piezo_ident.live.predictor import run_of
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -59,7 +59,7 @@ def grown(model, axis, gain=1.03):
 
 def moving(stage, earlier=0.0):
     """Return a run of a stage that stood at the highest voltages for some seconds, if at all."""
-    run, n = AxesRun(stage, AXES), round(earlier * RATE)
+    run, n = run_of(stage, AXES), round(earlier * RATE)
     if n:
         way = np.linspace(0.0, 10.0, 500)
         before = np.concatenate([way, np.full(n, 10.0), way[::-1]])

@@ -30,11 +30,20 @@ Y = MODEL.simulate(V) + 0.4e-6 + 2e-9 * np.random.default_rng(1).standard_normal
 class Line:
     """What the node does with the two streams."""
 
-    def __init__(self):
-        self.predictor, self.matcher, self.corrector = Predictor(), Matcher(), Corrector()
-        self.predictor.set_model(MODEL)
-        self.corrector.set_model(MODEL)
+    def __init__(self, model=MODEL, **options):
+        self.predictor, self.matcher = Predictor(), Matcher()
+        self.corrector = Corrector(**options)
+        self.predictor.set_model(model)
+        self.corrector.set_model(model)
         self.got = []
+
+    def play(self, y=Y, *, silent=()):
+        """Play both streams block by block; yield the first sample of each before it comes."""
+        for k in range(0, N, 100):
+            yield k
+            self.voltage(slice(k, k + 100))
+            if k not in silent:
+                self.displacement(slice(k, k + 100), y)
 
     def voltage(self, cut):
         samples = Samples(T[cut], V[cut])
@@ -44,8 +53,8 @@ class Line:
             self.got += self.corrector.predicted(prediction, samples, known)
             self._pairs(self.matcher.predicted(prediction))
 
-    def displacement(self, cut):
-        self._pairs(self.matcher.measured(Samples(T[cut], Y[cut], '', 'displacement')))
+    def displacement(self, cut, y=Y):
+        self._pairs(self.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
 
     def _pairs(self, pairs):
         for pair in pairs:
@@ -83,8 +92,7 @@ def test_neither_the_order_of_arrival_nor_cuts_matter(seed):
 
 def test_without_displacement_it_waits_half_a_second_and_goes_on():
     line = Line()
-    for k in range(0, N, 100):
-        line.voltage(slice(k, k + 100))
+    list(line.play(silent=range(N)))
     # the last wait for nothing
     assert len(line.got) == N // 100
     free = MODEL.simulate(V)
@@ -93,10 +101,7 @@ def test_without_displacement_it_waits_half_a_second_and_goes_on():
 
 def test_a_sensor_that_falls_silent_and_comes_back_is_used_again():
     line = Line()
-    for k in range(0, N, 100):
-        line.voltage(slice(k, k + 100))
-        if not 2000 <= k < 2000 + 0.7 * FS // 2:
-            line.displacement(slice(k, k + 100))
+    list(line.play(silent=range(2000, 9000)))
     t, y = line.rows
     reading = Y.copy()
     reading[2000:9000] = np.nan
@@ -123,12 +128,8 @@ def test_a_gap_of_voltage_and_a_restart_keep_it_going(missing):
 
 
 def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():
-    line = Line()
-    line.corrector = Corrector(gain=True, rate=100.0)
-    line.corrector.set_model(MODEL)
-    for k in range(0, N, 100):
-        line.voltage(slice(k, k + 100))
-        line.displacement(slice(k, k + 100))
+    line = Line(gain=True, rate=100.0)
+    list(line.play())
     _, y = line.rows
     expected = observe(MODEL, Piece(V, Y, FS), gain=True).estimate
     assert_allclose(y, expected, rtol=0, atol=1e-12 * 75e-6)
@@ -165,10 +166,7 @@ def test_what_changed_of_a_running_stage_is_named_with_its_size(stage, names):
     # an offset, noise and lost words change none of the names
     y = stage.simulate(V) + 0.4e-6 + 2e-9 * rng.standard_normal(N)
     y[777::900] = 0.0
-    for k in range(0, N, 100):
-        cut = slice(k, k + 100)
-        line.voltage(cut)
-        line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+    list(line.play(y))
     said = line.corrector.changed
     assert all(name in said for name in names)
     assert len(said.split(', ')) == max(len(names), 1) and bool(said) == bool(names)
@@ -185,28 +183,20 @@ def test_what_changed_of_a_running_stage_is_named_with_its_size(stage, names):
     ],
 )
 def test_a_sensor_at_fault_is_told_within_a_fifth_of_a_second_of_motion(fault, says):
-    line, y, at, told = Line(), Y.copy(), 6000, []
+    line, y, at = Line(), Y.copy(), 6000
     y[at:] = fault(y[at:])
-    for k in range(0, N, 100):
-        cut = slice(k, k + 100)
-        line.voltage(cut)
-        line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
-        told.append(line.corrector.doubt)
-    assert not any(told[: at // 100])
+    told = [line.corrector.doubt for _ in line.play(y)]
+    assert not any(told[: at // 100 + 1])
     # 0.2 s of a scan of 5 Hz
-    assert all(says in said for said in told[at // 100 + 40 :])
-    assert bool(told[-1]) == bool(says)
+    assert all(says in said for said in told[at // 100 + 41 :])
+    assert bool(line.corrector.doubt) == bool(says)
 
 
 def test_an_error_of_another_kind_is_given_no_name():
     line = Line()
     # a disturbance of another frequency, and a bend of the characteristic
     for more in (1e-7 * np.sin(2 * np.pi * 37 * T), 2e-8 * (V - 5.0) ** 2):
-        y = MODEL.simulate(V) + more
-        for k in range(0, N, 100):
-            cut = slice(k, k + 100)
-            line.voltage(cut)
-            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        list(line.play(MODEL.simulate(V) + more))
         assert line.corrector.changed == ''
 
 
@@ -223,16 +213,10 @@ def test_behind_a_gap_the_memory_is_unknown_before_its_displacement_has_come():
 
 
 def test_what_is_learnt_is_in_the_estimate_and_outlives_a_restart():
-    line = Line()
-    line.corrector = Corrector(adapt='gain')
-    line.corrector.set_model(MODEL)
-    y = 1.03 * MODEL.simulate(V)
+    line, y = Line(adapt='gain'), 1.03 * MODEL.simulate(V)
     for start in (0, 1):
         line.got.clear()
-        for k in range(0, N, 100):
-            cut = slice(k, k + 100)
-            line.voltage(cut)
-            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        list(line.play(y))
         t, estimate = line.rows
         # the second time it is known from the start
         first = 0 if start else 8000
@@ -252,17 +236,11 @@ def test_a_model_that_comes_later_learns_as_one_from_the_start():
     model, got = replace(MODEL, effects=(creep,)), []
     y = 1.03 * model.simulate(V)
     for late in (False, True):
-        line = Line()
-        line.predictor.set_model(model)
-        line.corrector = Corrector(adapt='hysteresis')
-        line.corrector.set_model(model)
-        for k in range(0, N, 100):
+        line = Line(model, adapt='hysteresis')
+        for k in line.play(y):
             if late and k == 2000:
                 line.corrector.set_up(100, False, False, 'hysteresis', line.predictor.caught_up)
                 line.got.clear()
-            cut = slice(k, k + 100)
-            line.voltage(cut)
-            line._pairs(line.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
         got.append((line.rows[1][-2000:], line.corrector.told['learnt/gain']))
     assert_allclose(*(x for x, _ in got), rtol=0, atol=2e-8)
     assert got[1][1] == pytest.approx(0.03, abs=2e-3)

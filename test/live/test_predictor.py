@@ -340,20 +340,20 @@ def test_preview_bins_hold_mean_least_and_largest():
     assert done[1].values == {'displacement': (299.5, 200.0, 399.0)}
 
 
-def test_preview_waits_for_a_late_quantity_but_not_for_ever():
+@pytest.mark.parametrize(
+    ('names', 't', 'begins'),
+    [
+        # it waits for a late quantity, but not for ever
+        ('pdpd', (0.0, 0.03, 0.03, 2.0), [[], [], [0.0], [0.02]]),
+        # and begins again behind a restart
+        ('ppp', (1.0, 0.0, 0.02), [[], [1.0], [0.0]]),
+    ],
+)
+def test_preview_closes_a_bin_when_all_of_it_is_there(names, t, begins):
     preview = Preview(50.0)
-    assert preview.add('prediction', np.array([0.0]), np.ones(1)) == []
-    assert preview.add('displacement', np.array([0.03]), np.ones(1)) == []
-    done = preview.add('prediction', np.array([0.03]), np.ones(1))
-    assert [b.t for b in done] == [0.0]
-    done = preview.add('displacement', np.array([2.0]), np.ones(1))
-    assert [b.t for b in done] == [0.02]
-
-
-def test_preview_begins_again_behind_a_restart():
-    preview = Preview(50.0)
-    done = [preview.add('prediction', np.array([t]), np.ones(1)) for t in (1.0, 0.0, 0.02)]
-    assert [[b.t for b in bins] for bins in done] == [[], [1.0], [0.0]]
+    added = zip(names, np.array(t)[:, None], strict=True)
+    done = [preview.add(name, at, np.ones(1)) for name, at in added]
+    assert [[b.t for b in bins] for bins in done] == begins
 
 
 def test_preview_leaves_out_what_is_no_number():
@@ -381,22 +381,27 @@ def test_live_error_is_the_rms_of_the_window():
         assert short.rms == 2.0
 
 
+def error_of(e, size=100):
+    """Return the live error of residuals [m] that come in blocks."""
+    live = LiveError(1.0)
+    for k in range(0, e.size, size):
+        live.add(block(k, size).t, e[k : k + size], 75e-6)
+    return live
+
+
 @pytest.mark.parametrize('size', [7, 100, 4000])
 def test_live_error_leaves_out_what_is_wild(size):
     rng, n = np.random.default_rng(0), 8000
-    e, live = rng.normal(1e-7, 1e-8, n), LiveError(1.0)
+    e = rng.normal(1e-7, 1e-8, n)
     rms, mean = np.sqrt(np.mean(e**2)), e.mean()
     wild = np.array([99, 100, 700, 1399, 4000, 4001, 4002])
     e[wild] = 1.0
-    for k in range(0, n, size):
-        live.add(block(k, size).t, e[k : k + size], 75e-6)
+    live = error_of(e, size)
     assert live.outliers == wild.size
     assert (live.rms, live.mean) == pytest.approx((rms, mean), rel=1e-3)
     # what happens often is the way of the stage
-    often = LiveError(1.0)
     e[::5] = 1.0
-    for k in range(0, n, size):
-        often.add(block(k, size).t, e[k : k + size], 75e-6)
+    often = error_of(e, size)
     assert often.outliers == 0 and often.rms > 0.2
 
 

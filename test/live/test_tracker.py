@@ -60,14 +60,6 @@ def test_a_reference_that_begins_with_nan_is_joined_at_its_first_number(first):
     assert np.abs(np.diff(v[:4000])).max() < 2e-2
 
 
-def test_how_it_is_cut_changes_nothing():
-    reference = sine(0.1)
-    one = tracked(Tracker(CREEP, SETTINGS), reference, 2000)
-    other = tracked(Tracker(CREEP, SETTINGS), reference, 77)
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-10)
-
-
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_limits_and_slew_hold_whatever_comes(seed):

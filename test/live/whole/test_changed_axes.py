@@ -6,16 +6,14 @@
 from dataclasses import replace
 import functools
 
-from axes_scanner import answer, AXES, creeping, ERRORS, grown, moving, path, RATE, scanner
+from axes_scanner import answer, AXES, creeping, ERRORS, grown, path, RATE, scanner
+from live_axes import chains, noise, tracked
 import numpy as np
 from numpy.testing import assert_allclose
 import piezo_ident as pi
 from piezo_ident.live.comparison import AxisComparison
 from piezo_ident.live.corrector import Corrector
-from piezo_ident.live.guard import GuardSettings
-from piezo_ident.live.live_learning import LiveLearning
 from piezo_ident.live.predictor import Predictor
-from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.multi_axis import alone, with_own
 from piezo_ident.model.observer import observe
 from piezo_ident.record.blocks import Samples
@@ -23,7 +21,6 @@ from piezo_ident.record.record import Piece
 import pytest
 
 N = 12_000
-LIMITS = GuardSettings(0.0, 10.0, 40e3, 200.0, 0.0, RATE)
 T = np.arange(N) / RATE
 
 
@@ -82,8 +79,8 @@ class Live:
         return [one.corrector.told for one in self.each]
 
 
-def noisy(y, seed=1):
-    return y + 1.5e-9 * np.random.default_rng(seed).standard_normal(y.shape)
+def noisy(y):
+    return y + noise(y.shape)
 
 
 def percents(error, model, first=N // 2):
@@ -171,98 +168,16 @@ def test_what_each_axis_learns_is_one_model_with_the_same_paths(tmp_path):
     assert (percents(missed, model) < 0.05).all()
 
 
-def tracked(follow, size=50, seconds=10.0, earlier=10.0):
-    """Track a scan of both axes; return the tracker, voltages, and errors [% of the span]."""
-    tracker = Tracker(creeping(), LIMITS, 60, follow, AXES)
-    run, t = moving(grown(creeping(), 'y_b'), earlier), np.arange(round(seconds * RATE)) / RATE
-    noise = noisy(np.zeros((2, t.size)))
-    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 0.7)])
-    wanted, parts = np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves), []
-    for k in range(0, t.size, size):
-        drive = tracker.process(wanted[:, k : k + size], k == 0)
-        y = run.process(drive.v, drive.t)
-        for i, row in enumerate(y + noise[:, k : k + size]):
-            tracker.measured(Samples(drive.t, row), i)
-        parts.append((drive.v, y - drive.wanted))
-    v, error = (np.hstack(rows) for rows in zip(*parts, strict=True))
-    return tracker, v, 100.0 * error / np.ptp(wanted, axis=1)[:, None]
-
-
 def test_each_axis_follows_its_reference_amid_creep_and_with_another_gain():
-    tracker, v, error = tracked('gain')
-    left, alone = (np.sqrt(np.mean(e[:, 5000:] ** 2, axis=1)) for e in (error, tracked('off')[2]))
+    kind = chains()
+    (tracker, v, error), (_, _, free) = (
+        tracked(kind, kind.wanted(10_000), follow, earlier=10.0) for follow in ('gain', 'off')
+    )
+    left, alone = (np.sqrt(np.mean(e[:, 5000:] ** 2, axis=1)) for e in (error, free))
     assert alone[0] > 0.5 and alone[1] > 1.0
     assert left.max() < 0.1
     gains = [one.corrector.told['gain/value'] for one in tracker.followers]
     assert gains == pytest.approx([0.0, 0.03], abs=1e-3)
-    assert v.min() >= LIMITS.low and v.max() <= LIMITS.high
-    assert np.abs(np.diff(v, axis=1)).max() <= LIMITS.step * (1 + 1e-9)
+    assert kind.within_limits(v)
     while not tracker.is_at_rest:
         tracker.idle(100)
-
-
-def test_how_the_streams_are_cut_does_not_matter_to_what_follows():
-    one, other = (tracked('gain', size, seconds=3.0) for size in (10, 37))
-    assert_allclose(one[1], other[1], rtol=0, atol=1e-9)
-
-
-def repeated(stage, wanted, most=6):
-    """Repeat a motion of both axes; return the learning, the voltages, and the last motion."""
-    learning, sent = LiveLearning(scanner(), wanted, LIMITS, AXES), []
-    while not learning.is_done and len(learning.errors) < most:
-        tracker = Tracker(scanner(), LIMITS, 60, axes=AXES)
-        t, v = tracker.play(learning.voltage)
-        y = stage.process(v, t)
-        for k, row in enumerate(noisy(y, len(sent))):
-            learning.measured(Samples(t, row), 0, k)
-        assert learning.is_complete
-        moved = y[:, -wanted.shape[1] :] - wanted
-        learning.take()
-        sent.append(v)
-        stage.process(*reversed(tracker.idle(3000)))
-    return learning, np.hstack(sent), moved
-
-
-def test_a_motion_of_all_axes_is_learnt_with_the_paths_made_up_for():
-    t = np.arange(2000) / RATE
-    waves = np.stack([np.cos(2 * np.pi * f * t) for f in (3.0, 2.0)])
-    wanted = np.array([[20e-6], [15e-6]]) * (1.0 - 0.8 * waves)
-    # the stage of the model is met at once, paths included
-    learning, _, _ = repeated(moving(scanner()), wanted, 1)
-    assert learning.errors[0] < 0.02
-    # one that creeps and moves more is not
-    learning, v, moved = repeated(moving(grown(creeping(), 'y_b')), wanted)
-    assert learning.errors[0] > 1.0 and min(learning.errors) < 0.1
-    assert (np.std(moved, axis=1) < 1e-3 * np.ptp(wanted, axis=1)).all()
-    assert v.min() >= LIMITS.low and v.max() <= LIMITS.high
-    assert np.abs(np.diff(v, axis=1)).max() <= LIMITS.step * (1 + 1e-9)
-
-
-def test_an_axis_that_nobody_moves_is_no_obstacle_to_learning():
-    t = np.arange(2000) / RATE
-    wanted = np.stack([20e-6 * (1.0 - 0.8 * np.cos(2 * np.pi * 3.0 * t)), np.zeros(t.size)])
-    # at its lowest voltage it cannot make up for what the first axis moves of it
-    learning, v, _ = repeated(moving(grown(scanner(), 'y')), wanted)
-    assert v[1].max() < 0.02
-    first = [r.error for r in learning.each['y'].repetitions]
-    assert first[0] > 1.0 and min(first) < 0.05
-
-
-def test_a_sensor_at_fault_ends_learning_with_the_name_of_its_axis():
-    t = np.arange(1000) / RATE
-    wanted = np.stack([15e-6 * (1.0 - 0.8 * np.cos(2 * np.pi * 3.0 * t))] * 2)
-    learning = LiveLearning(scanner(), wanted, LIMITS, AXES)
-    for broken in (True, False):
-        at = np.arange(learning.voltage.shape[1]) / RATE
-        y = answer(scanner(), learning.voltage)
-        for k, row in enumerate(y):
-            learning.measured(Samples(at, np.zeros(at.size) if broken and k else row), 0, k)
-        assert learning.is_complete
-        if broken:
-            with pytest.raises(pi.DataError, match='y_b: learning: the displacement stands'):
-                learning.take()
-        else:
-            # it goes on with what was sound
-            learning.take()
-            assert learning.errors[0] < 0.02
-        assert not learning.is_complete
