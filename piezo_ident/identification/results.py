@@ -184,7 +184,8 @@ class Identification(Showable):
     >>> import piezo_ident as pi
     >>> v = 5 - 5 * np.cos(2 * np.pi * np.arange(4000) / 1000)
     >>> y = 7e-6 * v + 2e-6 * np.sin(2 * np.pi * np.arange(4000) / 1000)
-    >>> result = pi.identify(pi.Record.from_arrays(v, y, sample_rate=1000))
+    >>> record = pi.Record.from_arrays(v, y, sample_rate=1000)
+    >>> result = pi.identify(record, pi.Settings(thresholds=4, order=(1, 1)))
     >>> result.model.simulate(v).shape
     (4000,)
     """

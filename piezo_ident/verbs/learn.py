@@ -218,7 +218,7 @@ def diagnose(
     >>> from piezo_ident.model.stage_model import EffectSetting
     >>> model = pi.SimulatedStage.load('paper').model
     >>> stage = replace(model, effects=(EffectSetting('saturation', {'high': 0.8}),))
-    >>> t = np.arange(20_000) / 20_000
+    >>> t = np.arange(10_000) / 20_000
     >>> v = 2.5 * (1 + np.floor(20 * t) % 2) * (1 - np.cos(40 * np.pi * t))
     >>> record = pi.Record.from_arrays(v, stage.simulate(v), sample_rate=20_000)
     >>> few = pi.DiagnosisSettings(effects=('saturation', 'backlash'))
