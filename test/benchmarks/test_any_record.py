@@ -12,7 +12,7 @@ from piezo_ident.identification.results import Settings
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-SECONDS = 1.0
+SECONDS = 0.6
 
 
 @pytest.fixture(scope='module')

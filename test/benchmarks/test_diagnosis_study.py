@@ -276,35 +276,28 @@ def test_blocks_of_cases_hold_every_kind():
 
 
 @pytest.mark.parametrize(
-    ('said', 'truth', 'expected'),
+    ('verdict', 'effects', 'group', 'truth', 'expected'),
     [
-        ({'verdict': 'named', 'effects': ('creep',)}, {'creep': 1.0}, 'named'),
-        ({'verdict': 'named', 'effects': ('creep', 'backlash')}, {'creep': 1.0}, 'false'),
-        ({'verdict': 'partly_explained', 'effects': ('creep',)}, {'creep': 1.0}, 'named'),
-        ({'verdict': 'partly_explained', 'effects': ('creep',)}, {'backlash': 1.0}, 'false'),
-        (
-            {'verdict': 'class', 'effects': ('creep',), 'group': ('creep', 'backlash')},
-            {'backlash': 1.0},
-            'class',
-        ),
-        (
-            {'verdict': 'class', 'effects': ('creep',), 'group': ('creep', 'saturation')},
-            {'backlash': 1.0},
-            'false',
-        ),
-        ({'verdict': 'refitted', 'group': ('backlash',)}, {'backlash': 1.0}, 'hidden'),
-        ({'verdict': 'refitted'}, {'backlash': 1.0}, 'abstained'),
-        ({'verdict': 'unexplained'}, {'backlash': 1.0}, 'abstained'),
-        ({'verdict': 'none'}, {'backlash': 0.1}, 'none'),
-        ({'verdict': 'none'}, {'periodic_disturbance': 0.1}, 'abstained'),
-        ({'verdict': 'named', 'effects': ('backlash',)}, {'backlash': 0.1}, 'small'),
-        ({'verdict': 'named', 'effects': ('backlash',)}, {}, 'false'),
-        ({'verdict': 'none'}, {}, 'none'),
-        ({'verdict': 'named', 'effects': ('creep',)}, {'creep': 1.0, 'backlash': 1.0}, 'part'),
+        ('named', 'creep', '', {'creep': 1.0}, 'named'),
+        ('named', 'creep backlash', '', {'creep': 1.0}, 'false'),
+        ('named', 'backlash', '', {'backlash': 0.1}, 'small'),
+        ('named', 'backlash', '', {}, 'false'),
+        ('named', 'creep', '', {'creep': 1.0, 'backlash': 1.0}, 'part'),
+        ('partly_explained', 'creep', '', {'creep': 1.0}, 'named'),
+        ('partly_explained', 'creep', '', {'backlash': 1.0}, 'false'),
+        ('class', 'creep', 'creep backlash', {'backlash': 1.0}, 'class'),
+        ('class', 'creep', 'creep saturation', {'backlash': 1.0}, 'false'),
+        ('refitted', '', 'backlash', {'backlash': 1.0}, 'hidden'),
+        ('refitted', '', '', {'backlash': 1.0}, 'abstained'),
+        ('unexplained', '', '', {'backlash': 1.0}, 'abstained'),
+        ('none', '', '', {'backlash': 0.1}, 'none'),
+        ('none', '', '', {'periodic_disturbance': 0.1}, 'abstained'),
+        ('none', '', '', {}, 'none'),
     ],
 )
-def test_outcome_of_a_row(said, truth, expected):
-    row = study.Row('tuning-000 preisach x labelled', misfit=0.5, truth=truth, **said)
+def test_outcome_of_a_row(verdict, effects, group, truth, expected):
+    row = study.Row('tuning-000 preisach x labelled', verdict, misfit=0.5, truth=truth)
+    row = replace(row, effects=tuple(effects.split()), group=tuple(group.split()))
     assert study.outcome(row) == expected
 
 

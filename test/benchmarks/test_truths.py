@@ -4,7 +4,6 @@
 """The stages that judge a diagnosis: independent, repeatable, of the wanted size."""
 
 import ast
-from dataclasses import replace
 from pathlib import Path
 import sys
 
@@ -81,17 +80,17 @@ def refits(base, v):
 def test_the_size_of_every_effect(record):
     t, v, _, other = record
     X = refits(make_base(1), v)
+    plain = truths.make_stage(None, 0.0, 1).respond(t, v, clean=True)
     for name in NAMES:
         stage = truths.make_stage(name, 0.3, 1)
         y = stage.respond(t, v, channels={'other': other}, clean=True)
-        plain = replace(stage, gains={}).respond(t, v, clean=True)
         left = 100 * remainder(X, (y - plain)[::8]) / np.ptp(plain)
         assert 0.1 < left < 0.9, f'{name}: {left:.3f} % of stroke is left'
 
 
 def test_the_base_is_one_that_plays_can_follow(record):
     t, v, *_ = record
-    for seed in range(3):
+    for seed in range(2):
         stage = truths.make_stage(None, 0.0, seed)
         y = stage.respond(t, v, clean=True)[::8]
         assert remainder(refits(stage.base, v), y) < 3e-4 * np.ptp(y)

@@ -19,9 +19,10 @@ import piezo_ident as pi
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-#: runs a script as if rclpy were not installed; diagnoses try those that look alike only, and no
-#: picture is rendered
+#: runs a script as if rclpy were not installed, with shorter motions; it tries the effects of the
+#: stage alone, few orders and few thresholds, and renders no picture
 BLOCKED = """
+from dataclasses import replace
 import functools, runpy, sys
 sys.modules['rclpy'] = None
 del sys.argv[0]
@@ -29,8 +30,20 @@ sys.path.insert(0, 'examples')
 import piezo_ident as pi
 from piezo_ident.report.figures import style
 style.png = lambda *_: bytes(33)
-few = ('creep', 'thermal_drift', 'gain_drift', 'rate_dependent_hysteresis', 'amplifier_lag')
-pi.diagnose = functools.partial(pi.diagnose, settings=pi.DiagnosisSettings(effects=few))
+few = pi.DiagnosisSettings(effects=('creep', 'rate_dependent_hysteresis'))
+pi.diagnose = functools.partial(pi.diagnose, settings=few)
+pi.identify = functools.partial(pi.identify, settings=pi.Settings(max_order=8, thresholds=12))
+
+def load(name, load=pi.Program.load):
+    program = load(name)
+    less = {'duration': lambda x: 0.4 * x, 'periods': lambda x: 1}
+    entries = (
+        replace(e, options={k: less[k](x) if k in less and x else x for k, x in e.options.items()})
+        for e in program.entries
+    )
+    return replace(program, entries=tuple(entries))
+
+pi.Program.load = load
 runpy.run_path(sys.argv[0], run_name='__main__')
 """
 

@@ -125,7 +125,7 @@ def test_an_older_file_that_takes_the_place_of_another_is_done(records, tmp_path
 
 
 def test_a_process_that_dies_costs_one_record(records, tmp_path):
-    done = run_many(records[:3], tmp_path / 'out', Deadly(), jobs=2)
+    done = run_many(records[:3], tmp_path / 'out', Deadly(), jobs=1)
     assert [row.record for row in done if row.is_good] == ['stage_1', 'stage_10']
 
 

@@ -80,7 +80,7 @@ def assert_equal(a: Record, b: Record) -> None:
 
 @settings(
     # one .mat costs a process
-    max_examples=8,
+    max_examples=5,
     deadline=None,
     # shrinking files takes minutes and finds nothing that the message does not say
     phases=[Phase.explicit, Phase.reuse, Phase.generate],
@@ -423,6 +423,6 @@ def test_measured_files(tmp_path, name, rates, sizes):
     assert [p.sample_rate for p in measured] == rates
     assert [p.n for p in measured] == sizes
     assert {f.name for f in measured.faults} <= {'rate_change'}
-    for out in FORMATS:
+    for out in ('r.csv', 'r.mcap'):
         assert pi.write(measured, tmp_path / out, storage=storage(out)) == ()
         assert_equal(pi.read(tmp_path / out), measured)

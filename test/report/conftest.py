@@ -42,7 +42,7 @@ def identified():
     fault = Fault('repeats', f'in {HOSTILE}', 3, 'dropped')
     pieces = (replace(piece, segments=tuple(segments)),)
     further = replace(further, pieces=pieces, faults=(fault,))
-    settings = pi.Settings(max_order=8, thresholds=10, solver='swarm', swarm_iterations=2000)
+    settings = pi.Settings(max_order=4, thresholds=10, solver='swarm', swarm_iterations=300)
     return pi.identify(measured(IDENTIFICATION, 'record'), settings, validation=further)
 
 

@@ -3,7 +3,6 @@
 
 """Files that are empty, damaged, of another kind or unreadable end in one clear error."""
 
-import os
 from pathlib import Path
 import random
 import re
@@ -72,7 +71,8 @@ def test_damaged_files(tmp_path, record, name):
     pi.write(record, path)
     file = file_of(path)
     whole = file.read_bytes()
-    for _ in range(6 if name == 'r.mat' else 60):
+    # a reading of .mat costs a process
+    for _ in range(3 if name == 'r.mat' else 40):
         data = bytearray(whole)
         for _ in range(rng.randint(1, 4)):
             data[rng.randrange(len(data))] = rng.randrange(256)
@@ -192,12 +192,3 @@ def test_no_pickle_and_no_unsafe_yaml_in_what_reads_files():
                 continue  # reads what a child process of its own has written
             text = file.read_text(encoding='utf-8').replace('yaml.safe_load(', '')
             assert not re.search(r'pickle\.load|allow_pickle=True|yaml\.\w*load', text), file
-
-
-def test_markup_in_a_label_is_carried_as_text(tmp_path):
-    label = '<script>alert(1)</script>'
-    rows = ''.join(f'{i / 10},{i},{i}e-6,{label}\n' for i in range(9))
-    (tmp_path / 'r.csv').write_text(f't,v,y,segment\n{rows}')
-    pi.write(pi.read(tmp_path / 'r.csv'), tmp_path / 'bag')
-    assert pi.read(tmp_path / 'bag').labels == (label,)
-    assert sorted(os.listdir(tmp_path)) == ['bag', 'r.csv']

@@ -6,15 +6,12 @@
 from dataclasses import fields
 from itertools import chain
 import json
-import os
 import shlex
-import subprocess
-import sys
 from types import SimpleNamespace
 
 from command_line import refuse, run, succeed
 import piezo_ident as pi
-from piezo_ident.cli import options
+from piezo_ident.cli import main, options
 from piezo_ident.cli.identify_command import prompt_of
 from piezo_ident.cli.main import cli
 from piezo_ident.record.options import ReadOptions
@@ -110,17 +107,14 @@ def test_commands_that_are_suggested_read_records_in_the_same_way(options):
         ('convert --storage m', 'plain,mcap'),
     ],
 )
-def test_a_shell_completes(words, wanted):
+def test_a_shell_completes(capsys, monkeypatch, words, wanted):
     line = f'piezo_ident {words}'
     asked = {'COMP_WORDS': line, 'COMP_CWORD': str(line.count(' '))}
-    done = subprocess.run(
-        [sys.executable, '-m', 'piezo_ident'],
-        env={**os.environ, '_PIEZO_IDENT_COMPLETE': 'bash_complete', **asked},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert wanted in done.stdout.splitlines()
+    for name, value in {'_PIEZO_IDENT_COMPLETE': 'bash_complete', **asked}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit, match='0'):
+        main([])
+    assert wanted in capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize('shell', ['bash', 'zsh', 'fish'])

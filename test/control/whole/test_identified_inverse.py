@@ -51,7 +51,7 @@ def labelled(record):
 @pytest.fixture(scope='module')
 def unlabelled(record):
     pieces = tuple(replace(piece, segments=()) for piece in record.pieces)
-    settings = Settings(order=(6, 6), thresholds=10, delay=3)
+    settings = Settings(order=(4, 4), thresholds=6, delay=3)
     return pi.identify(replace(record, pieces=pieces), settings).model
 
 
