@@ -34,6 +34,20 @@ import pytest
 FAST = ['--order', '2,2', '--thresholds', '5', '--solver', 'least_squares']
 
 
+def columns_of(path):
+    if path.suffix == '.npz':
+        return dict(np.load(path))
+    table = np.genfromtxt(path, delimiter=',', names=True)
+    return {name: table[name] for name in table.dtype.names}
+
+
+def tree(folder, *names, text=''):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
 def test_version_and_help(capsys):
     assert succeed(capsys, '--version') == f'piezo_ident {__version__}\n'
     text = succeed(capsys, '--help')
@@ -164,8 +178,8 @@ def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made
     assert '% of stroke' in text
     assert 'rms(y - y_hat)' in text
     assert picture.read_bytes().startswith(b'\x89PNG')
-    table = np.genfromtxt(out, delimiter=',', names=True)
-    assert table.dtype.names == ('t', 'v', 'y', 'y_hat')
+    table = columns_of(out)
+    assert [*table] == ['t', 'v', 'y', 'y_hat']
     piece = pi.read(made / 'sine.csv').pieces[0]
     np.testing.assert_array_equal(table['y'], piece.y)
     np.testing.assert_array_equal(table['y_hat'], model.predict_piece(piece))
@@ -176,19 +190,29 @@ def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made
     assert error < 0.2
     assert data['memory_estimated'] == [False]
     assert data['warnings'] == []
-    with np.load(tmp_path / 'y.npz') as archive:
-        np.testing.assert_array_equal(archive['y_hat'], table['y_hat'])
+    np.testing.assert_array_equal(columns_of(tmp_path / 'y.npz')['y_hat'], table['y_hat'])
 
 
-def test_predict_estimates_an_unknown_start_and_says_so(capsys, tmp_path, made):
-    piece = pi.read(made / 'sine.csv').pieces[0]
-    cut = Record((piece.cut(piece.n // 2 + 130, piece.n),))
-    pi.write(cut, tmp_path / 'cut.npz')
-    argv = ['predict', made / 'model.yaml', tmp_path / 'cut.npz']
-    text = succeed(capsys, *argv)
-    assert 'start forgotten' in text
-    assert 'estimated' in text
-    data = json.loads(succeed(capsys, *argv, '--json'))
+@pytest.fixture
+def predicted(capsys, tmp_path, made):
+    """Return what predicts a piece by the model, and returns what is said, and that as JSON."""
+
+    def predict(piece):
+        pi.write(Record((piece,)), tmp_path / 'r.npz', overwrite=True)
+        argv = ['predict', made / 'model.yaml', tmp_path / 'r.npz']
+        return succeed(capsys, *argv), json.loads(succeed(capsys, *argv, '--json'))
+
+    return predict
+
+
+@pytest.fixture
+def sine(made):
+    return pi.read(made / 'sine.csv').pieces[0]
+
+
+def test_predict_estimates_an_unknown_start_and_says_so(predicted, sine):
+    text, data = predicted(sine.cut(sine.n // 2 + 130, sine.n))
+    assert 'start forgotten' in text and 'estimated' in text
     assert data['memory_estimated'] == [True]
     assert data['start_forgotten']['n'] < data['whole']['n']
     assert data['start_forgotten']['percent_of_stroke'] < 0.3
@@ -205,13 +229,8 @@ def test_predict_from_a_voltage_alone(capsys, tmp_path, made, suffix):
         np.savez(scan, t=piece.t, v=piece.v)
     argv = ['predict', made / 'model.yaml', scan]
     assert '% of stroke' not in succeed(capsys, *argv, '--out', out)
-    if suffix == '.csv':
-        table = np.genfromtxt(out, delimiter=',', names=True)
-        names = table.dtype.names
-    else:
-        table = np.load(out)
-        names = tuple(table.files)
-    assert names == ('t', 'v', 'y_hat')
+    table = columns_of(out)
+    assert [*table] == ['t', 'v', 'y_hat']
     y_hat = load(made / 'model.yaml').simulate(piece.v)
     np.testing.assert_array_equal(table['y_hat'], y_hat)
     data = json.loads(succeed(capsys, *argv, '--json'))
@@ -235,44 +254,56 @@ def test_predict_from_a_voltage_that_starts_in_its_middle(capsys, tmp_path, made
     assert width == pytest.approx(100 * abs((down - up) / model.scaling.Y), rel=0.05)
 
 
-def test_predict_warns_outside_the_identified_range(capsys, tmp_path, made):
-    t = np.arange(2000) / 2000.0
-    v = 14.0 * np.sin(np.pi * t) ** 2
-    pi.write(Record((Piece(v, 7e-6 * v, 2000.0),)), tmp_path / 'far.csv')
-    text = succeed(capsys, 'predict', made / 'model.yaml', tmp_path / 'far.csv')
+def test_predict_warns_outside_the_identified_range(predicted):
+    v = 14.0 * np.sin(np.pi * np.arange(2000) / 2000.0) ** 2
+    text, _ = predicted(Piece(v, 7e-6 * v, 2000.0))
     assert 'outside the identified range' in ' '.join(text.split())
 
 
-def test_predict_tells_an_offset_from_a_bad_model(capsys, tmp_path, made):
-    piece = pi.read(made / 'sine.csv').pieces[0]
-    pi.write(Record((replace(piece, y=piece.y + 5e-6),)), tmp_path / 'shifted.npz')
-    argv = ['predict', made / 'model.yaml', tmp_path / 'shifted.npz']
-    text = succeed(capsys, *argv)
-    assert '% after removing a mean of 5.00' in text
-    assert 'set to zero elsewhere' in text
-    whole = json.loads(succeed(capsys, *argv, '--json'))['whole']
+def test_predict_tells_an_offset_from_a_bad_model(predicted, sine):
+    text, data = predicted(replace(sine, y=sine.y + 5e-6))
+    assert '% after removing a mean of 5.00' in text and 'set to zero elsewhere' in text
+    whole = data['whole']
     assert whole['offset'] == pytest.approx(5e-6, rel=0.01)
     assert whole['percent_of_stroke'] > 5.0
     assert whole['percent_of_stroke_without_offset'] < 0.2
     # nothing is said where there is no offset
-    plain = succeed(capsys, 'predict', made / 'model.yaml', made / 'sine.csv')
-    assert 'after removing' not in plain
-    assert 'set to zero' not in plain
-    assert 'runs against' not in plain
+    plain, _ = predicted(sine)
+    assert not any(words in plain for words in ('after removing', 'set to zero', 'runs against'))
 
 
-def test_predict_asks_after_a_reversed_sign(capsys, tmp_path, made):
-    piece = pi.read(made / 'sine.csv').pieces[0]
-    pi.write(Record((replace(piece, y=-40e-6 - piece.y),)), tmp_path / 'reversed.npz')
-    argv = ['predict', made / 'model.yaml', tmp_path / 'reversed.npz']
-    text = succeed(capsys, *argv)
+def test_lost_readings_are_left_out_of_all_that_is_said_written_and_drawn(
+    capsys, tmp_path, made, sine
+):
+    path, out, model = tmp_path / 'r.csv', tmp_path / 'out.csv', made / 'model.yaml'
+    # so few that every sample is drawn
+    piece = sine.cut(0, 2400)
+    lost = np.random.default_rng(0).random(piece.n) < 0.016
+    pi.write(Record((replace(piece, y=np.where(lost, 2e-4, piece.y)),)), path)
+    argv = ['predict', model, path, '--out', out]
+    whole = json.loads(succeed(capsys, *argv, '--json'))['whole']
+    assert whole['percent_of_stroke'] < 0.2 and whole['n'] == np.count_nonzero(~lost)
+    table = columns_of(out)
+    np.testing.assert_array_equal(np.isnan(table['y']), lost)
+    assert np.isfinite(table['y_hat']).all() and np.isfinite(table['v']).all()
+    said = succeed(capsys, *argv, '--overwrite')
+    assert f'{lost.sum()} readings are left out' in said
+    axes = pi.free_run(load(model), pi.read(path)).plot().axes
+    for drawn in axes[1:3]:
+        np.testing.assert_array_equal(np.isnan(drawn.lines[0].get_ydata()), lost)
+    assert f'{lost.sum()} readings left out' in axes[1].get_title('right')
+    # nor are they taken for an effect
+    said = succeed(capsys, 'diagnose', model, path, '--only', 'creep', '--json')
+    assert json.loads(said)['verdict'] in ('none', 'refitted')
+
+
+def test_predict_asks_after_a_reversed_sign(predicted, sine):
+    text, data = predicted(replace(sine, y=-40e-6 - sine.y))
     assert 'runs against the model: is a sign reversed' in text
     # more than half of the error is a mean, but the zero is where it was
     assert 'after removing a mean of' in text
     assert 'set to zero' not in text
-    assert any(
-        'runs against' in x for x in json.loads(succeed(capsys, *argv, '--json'))['warnings']
-    )
+    assert any('runs against' in x for x in data['warnings'])
 
 
 def test_identify_without_model_writes_nothing(capsys, tmp_path, made, monkeypatch):
@@ -301,10 +332,9 @@ def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith('.')] == []
 
 
-@pytest.mark.parametrize('name', ['r.csv', 'r.mat', 'bag'])
-def test_convert_round_trip(capsys, tmp_path, made, name):
+def test_convert_round_trip(capsys, tmp_path, made):
     record = pi.read(made / 'record.npz')
-    there, back = tmp_path / name, tmp_path / 'back.npz'
+    there, back = tmp_path / 'bag', tmp_path / 'back.npz'
     data = json.loads(succeed(capsys, 'convert', '--json', made / 'record.npz', there))
     assert (data['faults'], data['not_kept']) == ([], [])
     succeed(capsys, 'convert', there, back)
@@ -314,35 +344,27 @@ def test_convert_round_trip(capsys, tmp_path, made, name):
 
 
 def test_a_folder_of_records_leaves_none_out_unsaid(capsys, tmp_path):
-    for name in ('TEK0001.CSV', 'b.csv', 'notes.txt', '.hidden.csv'):
-        (tmp_path / name).write_text('')
-    (tmp_path / 'crashed').mkdir()
-    (tmp_path / 'crashed' / 'crashed.mcap').write_bytes(b'')
-    (tmp_path / 'pictures').mkdir()
+    lab = tree(tmp_path / 'lab', 'TEK0001.CSV', 'b.csv', 'notes.txt', '.hidden.csv')
     # a table beside a ledger holds the results of many records
-    (tmp_path / 'line').mkdir()
-    for name in (MARK, 'records.csv'):
-        (tmp_path / 'line' / name).write_text('')
+    tree(lab, 'crashed/crashed.mcap', f'line/{MARK}', 'line/records.csv')
+    (lab / 'pictures').mkdir()
+
+    def names():
+        return [path.name for path in expand([lab], Console())]
+
     taken = ['TEK0001.CSV', 'b.csv', 'crashed.mcap']
-    assert [path.name for path in expand([tmp_path], Console())] == taken
-    assert capsys.readouterr().err == ''
-    (tmp_path / 'long.dat').write_text('1.0 2.0\n' * 5000)
-    assert [path.name for path in expand([tmp_path], Console())] == taken
+    assert names() == taken and capsys.readouterr().err == ''
+    text = '1.0 2.0\n' * 5000
+    tree(lab, 'long.dat', text=text)
+    assert names() == taken
     assert 'long.dat: not read, as text may be anything; name' in capsys.readouterr().err
-    (tmp_path / 'long.dat').rename(tmp_path / 'crashed' / 'long.dat')
-    (tmp_path / 'crashed' / 'crashed.mcap').rename(tmp_path / 'crashed.mcap')
+    (lab / 'long.dat').unlink()
     with pytest.raises(DataError, match=r'long\.dat: not read, .*; name them$'):
-        expand([tmp_path / 'crashed'], Console())
-    (tmp_path / 'crashed' / 'long.dat').unlink()
-    (tmp_path / 'crashed.mcap').rename(tmp_path / 'crashed' / 'crashed.mcap')
-    (tmp_path / 'monday').mkdir()
-    (tmp_path / 'monday' / 'a.NPZ').write_text('')
-    (tmp_path / 'bags' / 'whole').mkdir(parents=True)
-    (tmp_path / 'bags' / 'whole' / 'metadata.yaml').write_text('')
-    assert [path.name for path in expand([tmp_path], Console())] == taken
+        expand([tree(tmp_path / 'other', 'long.dat', text=text)], Console())
+    tree(lab, 'monday/a.NPZ', 'bags/whole/metadata.yaml')
+    assert names() == taken
     said = capsys.readouterr().err
-    assert '(bags, monday)' in said
-    assert said.count('\n') == 1
+    assert '(bags, monday)' in said and said.count('\n') == 1
 
 
 def test_files_of_one_name_are_two_records(capsys, tmp_path, made):

@@ -176,15 +176,24 @@ def test_a_log_clock_that_is_set_back_and_a_restart(tmp_path):
     assert faults(got) == {'log_time_step': 1, 'restart': 1}
 
 
-def test_messages_that_were_written_out_of_turn_are_in_the_order_of_their_log_times(tmp_path):
+@pytest.mark.parametrize('mode', [None, CompressionMode.MESSAGE])
+def test_messages_that_were_written_out_of_turn_are_in_the_order_of_their_log_times(
+    tmp_path, mode
+):
+    # as threads do of which each writes the message that it has compressed
     messages, order = interleave(blocks()), [*range(20)]
     order[6:10] = [8, 9, 6, 7]
-
-    def stamp(i):
-        return 10**9 + order[i] * 10**6
-
-    got = read_bag(write(tmp_path / 'bag', [messages[k] for k in order], stamp=stamp))
+    path = write(
+        tmp_path / 'bag',
+        [messages[k] for k in order],
+        stamp=lambda i: 10**9 + order[i] * 10**6,
+        compression=mode,
+    )
+    got = read_bag(path)
     assert [p.n for p in got] == [1000] and not got.faults
+    if mode is not None:
+        (path / 'metadata.yaml').unlink()
+        assert [p.n for p in read_bag(path, recover=True)] == [1000]
 
 
 @pytest.mark.parametrize('statistics', [True, False])
@@ -235,20 +244,6 @@ def test_compressed_bags_and_what_is_left_of_them(tmp_path, storage, mode, capsy
     assert main([*shlex.split(shown), str(tmp_path / 'b.npz')]) == 0
     np.testing.assert_array_equal(pi.read(tmp_path / 'b.npz').pieces[0].y, want)
     assert 'metadata.yaml is missing' in capsys.readouterr().out
-
-
-def test_compressed_messages_that_threads_wrote_out_of_turn(tmp_path):
-    # each thread writes the message that it has compressed
-    messages, order = interleave(blocks()), [*range(20)]
-    order[6:10] = [8, 9, 6, 7]
-    path = write(
-        tmp_path / 'bag',
-        [messages[k] for k in order],
-        stamp=lambda i: 10**9 + order[i] * 10**6,
-        compression=CompressionMode.MESSAGE,
-    )
-    (path / 'metadata.yaml').unlink()
-    assert [p.n for p in read_bag(path, recover=True)] == [1000]
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3'])

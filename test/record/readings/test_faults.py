@@ -11,6 +11,7 @@ import piezo_ident as pi
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.identify import identify
+from piezo_ident.many.table import identified as cells
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.readings.suspicions import line_error, misspelt, suspicions
@@ -287,6 +288,7 @@ def test_the_model_of_lossy_readings_is_that_of_sound_ones():
         assert found.model.delay.samples == good.model.delay.samples
         assert any('lost' in w or 'outliers' in w for w in found.warnings)
         assert found.stroke == pytest.approx(good.stroke, rel=1e-3)
+        assert cells(found, record)['stroke'] == pytest.approx(good.stroke, rel=1e-3)
         assert found.headline.percent == pytest.approx(good.headline.percent, rel=0.1)
         assert found.noise_floor == pytest.approx(good.noise_floor, rel=0.15)
         # and the same errors, wherever they are printed

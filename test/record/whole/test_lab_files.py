@@ -21,6 +21,7 @@ import scipy.io
 
 RATE = 5000.0
 N = 2000
+TAB = '\t'
 K = np.arange(N)
 V = np.round(5 + 4 * np.sin(K / 40) * K / N, 4)
 UM = np.round(7.5 * V, 3)
@@ -57,77 +58,52 @@ def rows(*columns, separator=',', comma=False) -> str:
     return text.replace('.', ',') if comma else text
 
 
-def names_csv(path: Path) -> None:
-    path.write_text('time_s,voltage,position_um,note\n' + rows(K / RATE, V, UM, K))
+def tabs(*columns) -> str:
+    """Return rows with tabs and decimal commas."""
+    return rows(*columns, separator='\t', comma=True)
 
 
-def german_csv(path: Path) -> None:
-    table = rows(np.round(K / 5, 1), V, UM, separator=';', comma=True)
-    path.write_bytes(f'sep=;\r\nZeit [ms];Spannung [V];Weg [\u00b5m]\r\n{table}'.encode('cp1252'))
+def over_midnight(seconds: float) -> str:
+    """Return a time of the day."""
+    hour = '23:59' if seconds < 60 else '00:00'
+    return f'{hour}:{seconds % 60:07.4f}'
 
 
-def unicode_txt(path: Path) -> None:
-    table = rows(K / RATE, V, UM * 1e-6, separator='\t')
-    path.write_text(f'T\tV\tY\n{table}', encoding='utf-16')
-
-
-def quoted_csv(path: Path) -> None:
-    table = rows(K / RATE, V, UM, separator=';', comma=True)
-    text = table.replace(';', '","').replace('\n', '"\n"')[:-1]
-    path.write_text(f'"t [s]","v [V]","y [\u03bcm]"\n"{text}', encoding='utf-8-sig')
-
-
-def units_lvm(path: Path) -> None:
-    head = LVM.replace('X_Dimension', 'Y_Unit_Label\tVolts\tum\t\t\nX_Dimension')
-    table = rows(K / RATE, V, UM, separator='\t', comma=True)
-    path.write_text(f'{head}X_Value\tDrive\tStrain gauge\tComment\n{table}')
-
-
-def commented_txt(path: Path) -> None:
-    table = rows(K / RATE, V, UM, separator='\t').splitlines()
-    table.insert(500, '# somebody touched the table')
-    path.write_text('\n'.join(['# run 7', '#', '# Time[s]\tU_out[V]\tx[um]', *table]))
-
-
-def labview_lvm(path: Path) -> None:
-    table = rows(K / RATE, V, UM, separator='\t', comma=True).replace('\n', '\tstarted\n', 1)
-    path.write_text(f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n{table}')
-
-
-def without_time_lvm(path: Path) -> None:
-    table = rows(V, UM, separator='\t', comma=True).replace('\n', '\n\t')[:-1]
-    path.write_text(f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n\t{table}')
-
-
-def without_time_txt(path: Path) -> None:
-    path.write_text(
-        f'DAQ log\n10 May\n\nVoltage (V)\tPosition (um)\n{rows(V, UM, separator=chr(9))}'
-    )
-
-
-def scope_csv(path: Path) -> None:
-    path.write_text(f'Time,Drive,Position\n(ms),(V),(\u00b5m)\n\n{rows(K / 5, V, UM)}')
-
-
-def two_lines_txt(path: Path) -> None:
-    path.write_text(f'y\tv\tt\num\tV\tms\n\n{rows(UM, V, K / 5, separator=chr(9))}')
-
-
-def microseconds_csv(path: Path) -> None:
-    path.write_text('t_us,u,pos_nm\n' + rows(K * 200, V, np.round(1e3 * UM)))
-
-
-def rounded_csv(path: Path) -> None:
-    path.write_text('t,v,y\n' + rows(np.round(K / RATE, 3), V, 1e-6 * UM))
-
-
-def blanks_dat(path: Path) -> None:
-    header = 'made by hand\ntime [s]  voltage [V]  displacement [um]'
-    np.savetxt(path, np.column_stack([K / RATE, V, UM]), header=header, comments='% ')
-
-
-def headless_csv(path: Path) -> None:
-    path.write_text(rows(V, UM))
+START = datetime(2026, 11, 26, 23, 59, 59, 900_000)
+#: one decimal more than milliseconds, as a period of 0.2 ms needs
+ISO = [START + k * timedelta(microseconds=200) for k in range(N)]
+ISO = np.array([f'{x.isoformat(timespec="microseconds")[:-2]}Z' for x in ISO])
+DAY = np.array([over_midnight(round(59.9 + k / RATE, 4)) for k in range(N)])
+PLAIN, GERMAN = (rows(K / RATE, V, UM), rows(K / RATE, V, UM, separator=';', comma=True))
+#: tables as programs write them, UTF-8 unless they say otherwise
+TEXTS: dict[str, str | bytes] = {
+    'names.csv': 'time_s,voltage,position_um,note\n' + rows(K / RATE, V, UM, K),
+    'german.csv': 'sep=;\r\nZeit [ms];Spannung [V];Weg [\u00b5m]\r\n'.encode('cp1252')
+    + rows(np.round(K / 5, 1), V, UM, separator=';', comma=True).encode(),
+    'unicode.txt': f'T\tV\tY\n{rows(K / RATE, V, UM * 1e-6, separator=TAB)}'.encode('utf-16'),
+    'quoted.csv': (
+        '"t [s]","v [V]","y [\u03bcm]"\n"' + GERMAN.replace(';', '","').replace('\n', '"\n"')[:-1]
+    ).encode('utf-8-sig'),
+    'labview.lvm': f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n'
+    + tabs(K / RATE, V, UM).replace('\n', '\tstarted\n', 1),
+    'units.lvm': LVM.replace('X_Dimension', 'Y_Unit_Label\tVolts\tum\t\t\nX_Dimension')
+    + f'X_Value\tDrive\tStrain gauge\tComment\n{tabs(K / RATE, V, UM)}',
+    'without_time.lvm': f'{LVM}X_Value\tVoltage\tPosition (um)\tComment\n\t'
+    + tabs(V, UM).replace('\n', '\n\t')[:-1],
+    'commented.txt': '# run 7\n#\n# Time[s]\tU_out[V]\tx[um]\n'
+    + PLAIN.replace(',', TAB).replace('\n0.1\t', '\n# somebody touched the table\n0.1\t'),
+    'without_time.txt': 'DAQ log\n10 May\n\nVoltage (V)\tPosition (um)\n'
+    + rows(V, UM, separator=TAB),
+    'scope.csv': f'Time,Drive,Position\n(ms),(V),(\u00b5m)\n\n{rows(K / 5, V, UM)}',
+    'two_lines.txt': f'y\tv\tt\num\tV\tms\n\n{rows(UM, V, K / 5, separator=TAB)}',
+    'microseconds.csv': 't_us,u,pos_nm\n' + rows(K * 200, V, np.round(1e3 * UM)),
+    'rounded.csv': 't,v,y\n' + rows(np.round(K / RATE, 3), V, 1e-6 * UM),
+    'blanks.dat': '% made by hand\n% time [s]  voltage [V]  displacement [um]\n'
+    + PLAIN.replace(',', '  '),
+    'headless.csv': rows(V, UM),
+    'iso.csv': 'timestamp,voltage,position_um\n' + rows(ISO, V, UM),
+    'iso_german.csv': 'Zeit;Spannung [V];Weg [um]\n' + rows(DAY, V, UM, separator=';', comma=True),
+}
 
 
 def struct_mat(path: Path) -> None:
@@ -169,22 +145,6 @@ def daq_tdms(path: Path) -> None:
             writer.write_segment([tdms.ChannelObject('Log', name, x, wave)])
 
 
-def iso_csv(path: Path) -> None:
-    # over midnight; one decimal more than milliseconds, as a period of 0.2 ms needs
-    start = datetime(2026, 11, 26, 23, 59, 59, 900_000)
-    when = [start + k * timedelta(microseconds=200) for k in range(N)]
-    when = [f'{x.isoformat(timespec="microseconds")[:-2]}Z' for x in when]
-    path.write_text('timestamp,voltage,position_um\n' + rows(np.array(when), V, UM))
-
-
-def iso_german_csv(path: Path) -> None:
-    # over midnight, too
-    when = [f'23:59:{59.9 + k / RATE:07.4f}' for k in range(500)]
-    when = np.array(when + [f'00:00:{k / RATE:07.4f}' for k in range(N - 500)])
-    table = rows(when, V, UM, separator=';', comma=True)
-    path.write_text(f'Zeit;Spannung [V];Weg [um]\n{table}')
-
-
 def daq_parquet(path: Path) -> None:
     arrow = pytest.importorskip('pyarrow')
     parquet = pytest.importorskip('pyarrow.parquet')
@@ -193,45 +153,33 @@ def daq_parquet(path: Path) -> None:
     parquet.write_table(arrow.table(table), path)
 
 
-FILES = {
-    names_csv: '',
-    german_csv: '',
-    unicode_txt: '',
-    quoted_csv: '',
-    labview_lvm: '',
-    units_lvm: '',
-    commented_txt: '',
-    without_time_lvm: '',
-    without_time_txt: '--rate 5e3',
-    scope_csv: '',
-    two_lines_txt: '',
-    microseconds_csv: '',
-    rounded_csv: '',
-    blanks_dat: '',
-    headless_csv: '--columns v=1,y=2 --rate 5000 --displacement-unit um',
-    struct_mat: '',
-    matrix_mat: '--columns v=data.1,y=data.2 --displacement-unit \u00b5m',
-    any_npz: '',
-    v73_mat: '',
-    daq_h5: '',
-    daq_tdms: '',
-    daq_parquet: '',
-    iso_csv: '',
-    iso_german_csv: '',
+#: what writes each file that is no text, by its name
+WRITERS = {
+    'struct.mat': struct_mat,
+    'matrix.mat': matrix_mat,
+    'any.npz': any_npz,
+    'v73.mat': v73_mat,
+    'daq.h5': daq_h5,
+    'daq.tdms': daq_tdms,
+    'daq.parquet': daq_parquet,
+}
+#: what a file does not tell by itself
+OPTIONS = {
+    'without_time.txt': '--rate 5e3',
+    'headless.csv': '--columns v=1,y=2 --rate 5000 --displacement-unit um',
+    'matrix.mat': '--columns v=data.1,y=data.2 --displacement-unit \u00b5m',
 }
 
 
-def made(maker, folder: Path) -> Path:
-    name, _, suffix = maker.__name__.rpartition('_')
-    path = folder / f'{name}.{suffix}'
-    maker(path)
-    return path
-
-
-@pytest.mark.parametrize('maker', FILES, ids=lambda f: f.__name__)
-def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
-    path, out = made(maker, tmp_path), tmp_path / 'out.npz'
-    argv = ['convert', str(path), str(out), *shlex.split(FILES[maker])]
+@pytest.mark.parametrize('name', [*TEXTS, *WRITERS])
+def test_the_file_is_read_without_editing(tmp_path, capsys, name):
+    path, out = tmp_path / name, tmp_path / 'out.npz'
+    if name in WRITERS:
+        WRITERS[name](path)
+    else:
+        text = TEXTS[name]
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    argv = ['convert', str(path), str(out), *shlex.split(OPTIONS.get(name, ''))]
     assert main(argv) == 0, capsys.readouterr().err
     (piece,) = pi.read(out).pieces
     assert (piece.n, piece.sample_rate, piece.start_time) == (N, RATE, 0.0)
@@ -239,9 +187,8 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, maker):
     np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
     # what was guessed is printed
     said = capsys.readouterr().err
-    assert (' v is ' in said) is (maker is not rounded_csv)
-    assert said.count('\n') == (maker is not rounded_csv)
-    assert ("t is 'X_Value' in s" in said) is (maker in (labview_lvm, units_lvm))
+    assert (' v is ' in said) is (said.count('\n') == 1) is (name != 'rounded.csv')
+    assert ("t is 'X_Value' in s" in said) is (name in ('labview.lvm', 'units.lvm'))
 
 
 @pytest.mark.parametrize(
