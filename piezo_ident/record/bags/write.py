@@ -65,10 +65,10 @@ class BagWriter:
     """
     An open bag, or several one after the other; all calls must come from one thread.
 
-    A recording with a `max_size` [bytes on disk] has several parts: `flush` closes a part of that
-    size and begins the next.  Each part is a whole bag with all topics.  The parts are numbered in
-    their names; their custom data hold ``part`` and ``recording``.  DataError if a bag cannot be
-    made.
+    A recording with a `max_size` [bytes on disk] has several parts.  A part of that size is closed
+    by the first message after a `flush`, which begins the next part: no part is empty.  Each part
+    is a whole bag with all topics.  The parts are numbered in their names; their custom data hold
+    ``part`` and ``recording``.  DataError if a bag cannot be made.
 
     Parameters
     ----------
@@ -106,6 +106,7 @@ class BagWriter:
         self._custom_data = dict(custom_data or {})
         self._topics: dict[str, tuple[str, Sequence[Qos]]] = {}
         self._number = self._closed_size = self._closed_messages = 0
+        self._is_full = False
         self._begin()
 
     def _begin(self) -> None:
@@ -189,6 +190,8 @@ class BagWriter:
 
     def write(self, topic: str, stamp: int, raw: bytes) -> None:
         """Write a serialised message with its log time [ns]; DataError for a full disk."""
+        if self._is_full:
+            self._begin_part()
         with self._disk_errors():
             self._writer.write(self._connections[topic], stamp, raw)
         self.messages += 1
@@ -197,17 +200,19 @@ class BagWriter:
         """
         Hand all messages to the system, so that they survive the end of this process.
 
-        `flush` also closes a full part and begins the next part.  DataError if a bag cannot be
-        written.
+        DataError if a bag cannot be written.
         """
         with self._disk_errors():
             self._hand_over()
-        is_full = self.max_size and self._size_here() >= self.max_size
-        if is_full and self.messages > self._closed_messages:
-            self.close()
-            size = self.size
-            self._begin()
-            self._closed_size, self._closed_messages = size, self.messages
+        is_large = 0 < self.max_size <= self._size_here()
+        self._is_full = is_large and self.messages > self._closed_messages
+
+    def _begin_part(self) -> None:
+        self.close()
+        size = self.size
+        self._begin()
+        self._closed_size, self._closed_messages = size, self.messages
+        self._is_full = False
 
     def close(self) -> None:
         """Write index and metadata.yaml; after a DataError the messages can be recovered."""

@@ -120,7 +120,7 @@ def test_unknown_type_is_refused(tmp_path):
 
 
 def recorded(path, storage, parts_of, blocks=60):
-    """Write pairs of blocks, flushed after every fifth but the last."""
+    """Write pairs of blocks, flushed after every fifth."""
     writer = BagWriter(path, storage, {'sample_rate': repr(RATE)}, parts_of)
     for topic in ('/voltage', '/displacement'):
         writer.add_topic(topic, 'std_msgs/msg/Float64MultiArray')
@@ -128,8 +128,7 @@ def recorded(path, storage, parts_of, blocks=60):
         t = np.arange(SIZE * k, SIZE * (k + 1)) / RATE
         for topic, x in (('/voltage', 5 + np.sin(7 * t)), ('/displacement', 1e-6 * np.sin(7 * t))):
             writer.write(topic, 10**9 + 5_000_000 * k, raw(Samples(t, x, 'noise', topic[1:])))
-        # not after the last block, which would begin an empty part
-        if k % 5 == 4 and k < blocks - 1:
+        if k % 5 == 4:
             writer.flush()
     return writer
 
@@ -178,7 +177,19 @@ def test_a_part_that_cannot_be_made_leaves_those_before_it(tmp_path):
     (tmp_path / 'file').write_text('')
     writer.max_size = 1
     writer._path = tmp_path / 'file' / 'bag'
+    writer.flush()
     with pytest.raises(DataError, match='cannot be written'):
-        writer.flush()
+        writer.write('/voltage', 10**12, b'')
     writer.abort()
+    assert read_bag(tmp_path / 'bag').n == 2000
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_no_part_is_empty(tmp_path, storage):
+    writer = recorded(tmp_path / 'bag', storage, 10**9, blocks=20)
+    # full with the last message that comes
+    writer.max_size = 1
+    writer.flush()
+    writer.close()
+    assert [p.name for p in writer.parts] == ['bag']
     assert read_bag(tmp_path / 'bag').n == 2000
