@@ -12,7 +12,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.signal import firwin, lfilter
+from scipy.signal import fftconvolve, firwin, lfilter
 
 from .cores import Array, Rng
 
@@ -277,7 +277,7 @@ def band(rng: np.random.Generator, n: int, low: float, high: float) -> Array:
     """Return noise of unit rms between two frequencies [Hz], shape (n,)."""
     taps = min(8001, 2 * (n // 8) + 1)
     kernel = firwin(taps, [low, high], pass_zero=False, fs=RATE)
-    x = np.convolve(rng.standard_normal(n + taps - 1), kernel, mode='valid')
+    x = fftconvolve(rng.standard_normal(n + taps - 1), kernel, mode='valid')
     return np.asarray(x / max(float(x.std()), 1e-12))
 
 
