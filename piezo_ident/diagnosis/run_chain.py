@@ -11,7 +11,7 @@ Many columns of a fit therefore pass the links without a run of the whole chain.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -168,6 +168,41 @@ class RunChain:
         k = core + 1 - place
         behind = Behind(self.operators[core + 1 :], rests[k:], blocks[k:], m)
         return behind.rows(block.x - blocks[k].x, self.rests[core + 1] - rests[k])
+
+
+class _Known:
+    """Link whose output for the whole run is known."""
+
+    def __init__(self, output: Array, rest: float) -> None:
+        self._output, self._rest, self._at = output, rest, 0
+
+    def reset(self, v0: float, x0: float) -> float:
+        """Return the output at rest, and go back to the start of the run."""
+        self._at = 0
+        return self._rest
+
+    def process(self, block: Block) -> Block:
+        """Return the next samples of the output."""
+        start, self._at = self._at, self._at + block.x.size
+        return block.with_signal(self._output[start : self._at])
+
+
+def run_abreast(
+    effect: type[Effect], changed: Sequence[tuple[RunChain, int] | None], before: RunChain
+) -> None:
+    """
+    Run the links of an effect behind H together, if they then run faster, and keep their outputs.
+
+    The chains differ from the kept chain `before` in this effect alone, at the given places.
+    """
+    own = [one for one in changed if one and type(one[0].operators[one[1]]) is effect]
+    if not own or own[0][1] <= place_of_core(before.operators):
+        return
+    links = [cast(Effect, chain.operators[place]) for chain, place in own]
+    outputs = effect.abreast(links, before.blocks[own[0][1]])
+    for (chain, place), output in zip(own, outputs or (), strict=False):
+        known = _Known(output, chain.rests[place + 1])
+        chain.operators = (*chain.operators[:place], known, *chain.operators[place + 1 :])
 
 
 class _Once(HysteresisOperator):

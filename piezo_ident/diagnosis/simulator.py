@@ -31,6 +31,7 @@ from piezo_ident.diagnosis.run_chain import (
     moving_effects,
     place_of,
     place_of_core,
+    run_abreast,
     RunChain,
 )
 from piezo_ident.diagnosis.state import (
@@ -47,6 +48,8 @@ from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator, filt
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
 
 T = TypeVar('T')
+#: state with a change of an effect, or of the factor of G, in a record or in all; and a run
+Task = tuple[State, type[Effect] | None, int | None, int]
 
 #: largest number of runs that are computed side by side
 MOST_THREADS = 8
@@ -242,20 +245,25 @@ class Simulator:
         record, or in all (None).  The chain runs from this place on.  A state that cannot run has
         None.
         """
-        chains, runs = self._known().chains, range(len(self._sources))
+        before, runs = self._known().chains, range(len(self._sources))
+        tasks = [(*change, i) for change in changes for i in runs]
+        changed = list(self._pool.map(self._changed, tasks))
+        for effect in dict.fromkeys(effect for _, effect, _ in changes if effect is not None):
+            for i in runs:
+                of_effect = ((task[1] is effect and task[3] == i) for task in tasks)
+                run_abreast(effect, list(itertools.compress(changed, of_effect)), before[i])
 
-        def of_run(task: tuple[State, type[Effect] | None, int | None, int]) -> Array | None:
-            state, effect, record, i = task
+        def of_run(task: Task, one: tuple[RunChain, int] | None) -> Array | None:
+            *_, record, i = task
             if record is not None and record != self.rows.record[i]:
                 return np.zeros(self.rows.keep[i].size)
             try:
-                after = self._chain(state, i)
-                return after.difference(chains[i], place_of(effect, after.operators), self.rows.m)
+                return None if one is None else one[0].difference(before[i], one[1], self.rows.m)
             except ModelError:
                 return None
 
         # a run alone leaves the other processors to the other states
-        parts = list(self._pool.map(of_run, [(*change, i) for change in changes for i in runs]))
+        parts = list(self._pool.map(of_run, tasks, changed))
         found: list[Array | None] = []
         for k in range(0, len(parts), len(runs)):
             kept = [
@@ -265,6 +273,17 @@ class Simulator:
             ]
             found.append(np.concatenate(kept) if len(kept) == len(runs) else None)
         return found
+
+    def _changed(self, task: Task) -> tuple[RunChain, int] | None:
+        """Return the chain of a state with the place of its change; None if it cannot run."""
+        state, effect, record, i = task
+        if record is not None and record != self.rows.record[i]:
+            return None
+        try:
+            chain = self._chain(state, i)
+        except ModelError:
+            return None
+        return chain, place_of(effect, chain.operators)
 
     def sloped(self, wanted: Sequence[tuple[int | None, str]]) -> dict[int, Array]:
         """

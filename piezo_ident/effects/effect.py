@@ -336,6 +336,11 @@ class Effect:
         """
         return {}
 
+    @classmethod
+    def abreast(cls, effects: Sequence[Effect], block: Block) -> list[Array] | None:
+        """Compute the outputs of several effects at rest together; None if that is no faster."""
+        return None
+
     def of_parts(
         self, block: Block, rest: float, parts: Iterable[tuple[Hysteresis, Array]]
     ) -> Iterator[Array]:

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import product
+from collections.abc import Mapping, Sequence
+import itertools
 import math
 from typing import Any
 
@@ -18,6 +18,8 @@ from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, Value, Vie
 from piezo_ident.effects.second_order import slope_of_mode
 from piezo_ident.operators.c_code import CCode, Numbers, read_c
 from piezo_ident.operators.chain import Block
+from piezo_ident.operators.hysteresis import LANES
+from piezo_ident.operators.kernels import held
 from scipy.linalg import expm
 
 #: repetitions of a sub-step; each multiplies the error by a sixth of the squared phase
@@ -109,6 +111,58 @@ def run_loop(
         w2, w1 = w1, w0
     state[0], state[1], state[2], state[3], state[4], state[5] = w1, w2, l0, l1, d0, d1
     state[6] = h
+
+
+@ordered_kernel
+def run_loops(
+    x: Array, step: Array, count: int, fixed: Array, linear: Array, state: Array, lanes: int
+) -> Array:
+    """
+    Compute `run_loop` for eight springs of one mode side by side; forces of shape (n, 8).
+
+    Each spring has one element and the power 1.  `fixed`, shape (10 * 8,), holds elastic, viscous,
+    square, cubic, stiffness, threshold, gamma and skew, and q and force at rest.  `linear` holds
+    the last two inputs, q and p of the linear mode, and the input at rest.  `state`, shape
+    (5 * 8,), holds the change of q and p by the spring, force, play and slip.  `lanes` is 8.
+    """
+    w1, w2, l0, l1, rest_x = linear[0], linear[1], linear[2], linear[3], linear[4]
+    out = np.empty((x.size, LANES))
+    for k in range(x.size):
+        w0 = x[k] - rest_x
+        slope, bend = 0.5 * (3.0 * w0 - 4.0 * w1 + w2), 0.5 * (w0 - 2.0 * w1 + w2)
+        begin = w1
+        for j in range(count):
+            tau = (j + 1.0) / count - 1.0
+            end = w0 + tau * (slope + tau * bend)
+            m0 = step[0, 0] * l0 + step[0, 1] * l1 + step[0, 2] * begin + step[0, 3] * end
+            m1 = step[1, 0] * l0 + step[1, 1] * l1 + step[1, 2] * begin + step[1, 3] * end
+            # a number of lanes that the compiler knew would be unrolled instead of vectorised, and
+            # so would rows of an unknown length
+            for i in range(lanes):
+                d0, d1, h = state[i], state[LANES + i], state[2 * LANES + i]
+                before, slipped = state[3 * LANES + i], state[4 * LANES + i]
+                e0 = step[0, 0] * d0 + step[0, 1] * d1 - step[0, 2] * h
+                e1 = step[1, 0] * d0 + step[1, 1] * d1 - step[1, 2] * h
+                r, gamma, skew = fixed[5 * LANES + i], fixed[6 * LANES + i], fixed[7 * LANES + i]
+                force, play, slip = h, before, slipped
+                for _ in range(REPEATED):
+                    q = fixed[8 * LANES + i] + (m0 + e0 - step[0, 3] * force)
+                    p = m1 + e1 - step[1, 3] * force
+                    curve = fixed[2 * LANES + i] + q * fixed[3 * LANES + i]
+                    force = q * (fixed[i] + q * curve) + fixed[LANES + i] * p
+                    play = held(before, q - r, q + r)
+                    slip = _slipped(slipped, play - before, gamma, skew, 1.0)
+                    force = force + fixed[4 * LANES + i] * slip - fixed[9 * LANES + i]
+                state[i] = alive(e0 - step[0, 3] * force)
+                state[LANES + i] = alive(e1 - step[1, 3] * force)
+                state[2 * LANES + i] = force
+                state[3 * LANES + i], state[4 * LANES + i] = play, slip
+            l0, l1 = alive(m0), alive(m1)
+            begin = end
+        for i in range(lanes):
+            out[k, i] = fixed[9 * LANES + i] + state[2 * LANES + i]
+        w2, w1 = w1, w0
+    return out
 
 
 def mode_step(
@@ -241,7 +295,7 @@ class LoopHysteresis(Effect):
                     'stiffness': [0.0],
                 }
             )
-            for slip, skew in product(SLIPS, SKEWS)
+            for slip, skew in itertools.product(SLIPS, SKEWS)
         )
 
     def reset(self, v0: float, x0: float) -> float:
@@ -266,6 +320,45 @@ class LoopHysteresis(Effect):
         force, x = np.empty(block.x.size), np.ascontiguousarray(block.x)
         run_loop(x, self._step, self._spring, self._elements, self._state, self._memory, force)
         return block.with_signal(x - force)
+
+    @classmethod
+    def abreast(cls, effects: Sequence[Effect], block: Block) -> list[Array]:
+        """Compute the outputs of several effects; eight springs of one mode run side by side."""
+        found: list[Array] = []
+        loops = [effect for effect in effects if isinstance(effect, cls)]
+        for mode, some in itertools.groupby(loops, cls._lane):
+            springs = list(some)
+            if mode is None:
+                found += [one.process(block).x for one in springs]
+                continue
+            for k in range(0, len(springs), LANES):
+                found += cls._side_by_side(springs[k : k + LANES], block)
+        return found
+
+    def _lane(self) -> tuple[int, bytes] | None:
+        """Return grid and mode of a spring that can run beside others, else None."""
+        is_usual = self._elements.shape[0] == 1 and self.number('power') == 1.0
+        if self._silent or not is_usual:
+            return None
+        return int(self._spring[3]), self._step.tobytes()
+
+    @classmethod
+    def _side_by_side(cls, springs: Sequence[LoopHysteresis], block: Block) -> list[Array]:
+        x, one = np.ascontiguousarray(block.x), springs[0]
+        # idle lanes repeat the last spring
+        lanes = [*springs, *[springs[-1]] * (LANES - len(springs))]
+        fixed = [[*z._spring[[0, 1, 4, 5]], *z._elements[0], *z._state[8:]] for z in lanes]
+        state = [[*z._state[4:7], *z._memory[0]] for z in lanes]
+        forces = run_loops(
+            x,
+            one._step,
+            int(one._spring[3]),
+            np.array(fixed).T.ravel(),
+            one._state[[0, 1, 2, 3, 7]],
+            np.array(state).T.ravel(),
+            LANES,
+        )
+        return [x - force for force in forces.T[: len(springs)]]
 
     def c_code(self) -> CCode:
         """Write the effect in C."""

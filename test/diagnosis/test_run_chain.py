@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from piezo_ident.diagnosis.run_chain import Behind
+from piezo_ident.diagnosis.run_chain import Behind, run_abreast, RunChain
 from piezo_ident.effects import find_effect
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
+from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.residual.stretches import block_means
 import pytest
 
@@ -86,3 +87,39 @@ def test_a_curve_passes_a_change_as_two_runs_do():
         moved = link.process(moved)
     difference = block_means(moved.x - blocks[2].x, m)
     np.testing.assert_allclose(found, difference, rtol=0, atol=1e-12)
+
+
+def test_springs_side_by_side_move_as_each_does_alone():
+    rate, x = 5000.0, motion(3000, 0.3)
+    block = Block(t=np.arange(x.size) / rate, v=x, x=x)
+    loop = find_effect('loop_hysteresis')
+    mode = {'frequency': 300.0, 'damping': 0.02}
+    springs = [
+        {
+            **mode,
+            **{'elastic': 0.01 * i, 'square': -0.01 * i, 'cubic': 0.02 * i, 'viscous': 1e-3 * i},
+            **{'stiffness': [0.02 * i], 'threshold': [0.002 * i]},
+            **{'gamma': [3.0 * (i % 3)], 'skew': [-0.1 * i]},
+        }
+        for i in range(10)
+    ]
+    # a finer grid, another law, two elements, and a spring that does nothing
+    springs[3] |= {'elastic': 2.0}
+    springs[5] |= {'power': 1.5}
+    springs.append({**mode, 'stiffness': [0.1, 0.2], 'gamma': [1.0, 0.0]})
+    springs.append({**mode, 'stiffness': [0.0]})
+    h = HysteresisOperator(Hysteresis([], [], 0.0, 1.0))
+    last = DelayOperator(Delay(1))
+    before = RunChain((h, last), block)
+    before.output(keep=True)
+    alone, together = (
+        [RunChain((h, loop(rate, spring), last), block) for spring in springs] for _ in range(2)
+    )
+    run_abreast(loop, [None, *((chain, 1) for chain in together)], before)
+    for one, other in zip(alone, together, strict=True):
+        assert type(other.operators[1]) is not loop
+        found = one.difference(before, 1, 4)
+        assert np.isfinite(found).all()
+        # the second pass begins at the start, too
+        for _ in range(2):
+            np.testing.assert_array_equal(other.difference(before, 1, 4), found)
