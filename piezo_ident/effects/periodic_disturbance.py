@@ -5,10 +5,36 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from piezo_ident.common.arrays import Array
+from piezo_ident.common.kernel import ordered_kernel
 from piezo_ident.effects.effect import Effect, NAN, Parameter, Trial, View
 from piezo_ident.operators.c_code import CCode
 from piezo_ident.operators.chain import Block
+
+#: coefficients of x^21, x^19, ..., x of the sine, exact to rounding up to a quarter of a turn
+SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(10, -1, -1))
+
+
+@ordered_kernel
+def _add_lines(t: Array, frequency: Array, amplitude: Array, phase: Array, y: Array) -> None:
+    # phases in turns.  A sine of the mathematical library takes ten times as long
+    for i in range(frequency.size):
+        f, a, p = frequency[i], amplitude[i], phase[i]
+        if a == 0.0:
+            continue
+        for k in range(t.size):
+            turn = f * t[k] + p
+            turn -= math.floor(turn + 0.5)
+            half = 0.5 if turn > 0.0 else -0.5
+            turn = half - turn if abs(turn) > 0.25 else turn
+            x = 2.0 * math.pi * turn
+            z, s = x * x, 0.0
+            for c in SINE:
+                s = s * z + c
+            y[k] += a * (x * s)
 
 
 class PeriodicDisturbance(Effect):
@@ -58,12 +84,9 @@ class PeriodicDisturbance(Effect):
 
     def process(self, block: Block) -> Block:
         """Add the lines to the block."""
-        y = block.x.copy()
-        turn = 2 * np.pi * self.number('frequency')
-        lines = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
-        for m, amplitude, phase in zip(*lines, strict=True):
-            if amplitude != 0.0:
-                y += amplitude * np.sin(turn * m * block.t + phase)
+        y, t = block.x.copy(), np.ascontiguousarray(block.t)
+        m, amplitude, phase = (self.array(name) for name in ('harmonic', 'amplitude', 'phase'))
+        _add_lines(t, self.number('frequency') * m, amplitude, phase / (2.0 * np.pi), y)
         return block.with_signal(y)
 
     def c_code(self) -> CCode:
