@@ -209,13 +209,15 @@ def _linearised(here: _Point, stretches: Sequence[Stretch]) -> Equations:
         if not at.size:
             continue
         e, block = (s.x - own[2] - stage.added(s))[at], s.block[at]
-        columns = {j: c[at] for j, c in enumerate(stage.columns(s, own)) if c is not None}
-        alive, M = list(columns), np.array(list(columns.values()))
+        M = np.zeros((p, at.size))
+        for row, column in zip(M, stage.columns(s, own), strict=True):
+            if column is not None:
+                np.take(column, at, out=row, mode='clip')
         edges = np.concatenate([[0], np.flatnonzero(np.diff(block)) + 1, [at.size]])
         for start, stop in itertools.pairwise(edges):
             k, part = block[start], M[:, start:stop]
-            A[np.ix_([k], alive, alive)] += part @ part.T
-            b[k, alive] += part @ e[start:stop]
+            A[k] += part @ part.T
+            b[k] += part @ e[start:stop]
             total[k] += e[start:stop] @ e[start:stop]
             rows[k] += stop - start
     return Equations(A, b, total, rows)
