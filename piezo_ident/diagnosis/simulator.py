@@ -127,9 +127,11 @@ class Simulator:
             self._of_law = None
             self._of_law = key, self._of_columns(wide.size, partial(self._behind_G, wide))
         whole = self._of_law[1]
-        places = slice(None) if law.name == wide.name else law.within(wide)
+        places = range(law.size) if law.name == wide.name else law.within(wide)
         found = np.empty((law.size + more.shape[0], self.rows.n))
-        found[: law.size], found[law.size :] = whole[places], more
+        for column, place in zip(found, places, strict=False):
+            column[:] = whole[place]
+        found[law.size :] = more
         return found
 
     def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Iterator[Array]:

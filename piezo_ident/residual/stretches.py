@@ -120,6 +120,8 @@ def strokes_of(parts: Sequence[ResidualPart]) -> dict[str, float]:
 
 def block_means(x: Array, m: int) -> Array:
     """Compute the means of whole blocks of m samples, shape (n // m,)."""
+    if m == 1:
+        return x
     n = x.size // m
     # a product with a vector is several times faster than a mean along a short axis
     return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
