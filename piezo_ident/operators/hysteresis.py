@@ -146,8 +146,8 @@ class Hysteresis:
             if not np.all(np.isfinite(values)):
                 raise ModelError(f'hysteresis: {name} must be finite numbers')
             object.__setattr__(self, name, values)
-        places = np.linspace(0.0, 1.0, 33)
-        rises = [self.rise(low + s * self._wide[4], low + s * (high - low)) for s in places]
+        places = np.linspace(0.0, 1.0, 33)[:, None]
+        rises = self.rise(low + places * self._wide[4], low + places * (high - low))
         least = float(np.min(rises, initial=0.0))
         if least < -ROUNDING * max(1.0, float(q.max(initial=0.0))):
             raise ModelError(
@@ -186,8 +186,8 @@ class Hysteresis:
         rows[:2, :m], rows[2:, :m] = (self.thresholds, self.weights), self._wide
         return rows[0], rows[1], self.p1, self.p2, self.p0, self.span[0], rows[2:]
 
-    def rise(self, outputs: ArrayLike, v: float = 0.0) -> Array:
-        """Compute dw/dF_i of each play at its output, shapes (m,); only a bias depends on v."""
+    def rise(self, outputs: ArrayLike, v: Array | float = 0.0) -> Array:
+        """Compute dw/dF_i of plays at their outputs, shapes (..., m); only a bias depends on v."""
         if not self._is_curved:
             return self.weights
         c1, c2, c3, bias, width = self._wide
@@ -217,10 +217,8 @@ class Hysteresis:
         places = np.linspace(low, high, 129)
         slope = self.slope_at_turns(places)
         if sweeps:
-            levels = np.linspace(low, high, 9)
-            ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
-            legs = [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise(ends) if a != b]
-            v = np.concatenate(legs)
+            # a frozen array would be another type to the compiler
+            v = np.array(_sweeps(low, high))
             places = np.append(places, v[1:])
             slope = np.append(slope, np.diff(self(v)) / np.diff(v))
         return places, slope
@@ -351,6 +349,15 @@ class Hysteresis:
             lags = np.append(lags, x[0])
         relaxing(x, np.array(self.relaxations), lags, out)
         return out, np.concatenate([end, lags])
+
+
+@functools.lru_cache(maxsize=8)
+def _sweeps(low: float, high: float) -> Array:
+    """Compute voltages that sweep between any two of nine voltages of a span."""
+    levels = np.linspace(low, high, 9)
+    ends = [e for a in levels for b in levels if b > a for e in (low, high, a, b, a, high)]
+    legs = [np.linspace(a, b, 33)[1:] for a, b in itertools.pairwise(ends) if a != b]
+    return frozen_array(np.concatenate(legs))
 
 
 class HysteresisOperator:
