@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from scipy.optimize import lsq_linear, nnls
 
@@ -84,8 +84,8 @@ def bounded_step(
     """
     Minimise ``x'A x - 2 b'x + x' diag(prior) x`` inside bounds; the step has shape (p,).
 
-    `damping` is a share of the energy of each column.  `rising` holds rows, shape (k, p), and the
-    least value of ``rows x``, shape (k,), which the step keeps if an x with these values exists.
+    `damping` is a share of the energy of each column.  `rising` holds rows, shape (k, q), and the
+    least value of ``rows x[:q]``, shape (k,), which the step keeps if such an x exists.
     Raises IdentificationError if the equations are not finite.
 
     Examples
@@ -112,8 +112,7 @@ def bounded_step(
             # bvls divides by zero if an active set is within rounding of its bound
             x[wide] = lsq_linear(L.T[:, wide], target, bounds, method='trf').x
         if rising is not None:
-            rows = (rising[0] / size)[:, wide]
-            x[wide] = _no_less(x[wide], L.T[:, wide], target, bounds, (rows, rising[1]))
+            x[wide] = _no_less(x[wide], L.T[:, wide], target, bounds, rising, wide, size)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise IdentificationError(
             f'the free-run fit is singular ({error}): its parameters do not follow from these '
@@ -128,26 +127,34 @@ def _no_less(
     target: Array,
     bounds: tuple[Array, Array],
     rising: tuple[Array, Array],
+    wide: Mask,
+    size: Array,
 ) -> Array:
     """
     Minimise ``|M x - target|`` inside bounds, with ``rows x`` at least as large as required.
 
-    In each turn the most violated row joins the inequalities.  The problem of least distance then
-    meets them: C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974,
-    chapter 23, doi:10.1137/1.9781611971217.
+    The step is x over `size` in the columns `wide`, and zero elsewhere.  In each turn the most
+    violated row joins the inequalities.  The problem of least distance then meets them:
+    C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23,
+    doi:10.1137/1.9781611971217.
     """
     (lower, upper), (rows, least) = bounds, rising
+    step, row = np.zeros(size.size), np.zeros(size.size)
+    step[wide] = x / size[wide]
+    short = least - rows @ step[: rows.shape[1]]
+    if short.max() <= UNDERCUT:
+        return x
     Q, R = np.linalg.qr(M)
     middle, one = np.linalg.solve(R, Q.T @ target), np.eye(x.size)
     below, above = np.isfinite(lower), np.isfinite(upper)
     E = np.vstack([one[below], -one[above]])
     f = np.concatenate([lower[below], -upper[above]])
     for _ in range(CUTS):
-        short = least - rows @ x
         k = int(np.argmax(short))
         if short[k] <= UNDERCUT:
             break
-        E, f = np.vstack([E, rows[k]]), np.append(f, least[k])
+        row[: rows.shape[1]] = rows[k]
+        E, f = np.vstack([E, (row / size)[wide]]), np.append(f, least[k])
         G, h = np.linalg.solve(R.T, E.T), f - E @ middle
         # the distance of the farthest half-space is the unit of the distance
         unit = float(np.max(h / np.linalg.norm(G, axis=0)))
@@ -160,4 +167,6 @@ def _no_less(
             # no x meets all inequalities
             break
         x = middle - unit * np.linalg.solve(R, left[:-1] / left[-1])
+        step[wide] = x / size[wide]
+        short = least - rows @ step[: rows.shape[1]]
     return x

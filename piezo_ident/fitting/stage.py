@@ -106,13 +106,7 @@ class Stage:
     rested: bool = True
 
     @classmethod
-    def linear(
-        cls,
-        law: HysteresisLaw,
-        dynamics: Dynamics,
-        delay: int,
-        guesses: Array,
-    ) -> Stage:
+    def linear(cls, law: HysteresisLaw, dynamics: Dynamics, delay: int, guesses: Array) -> Stage:
         """Make a stage whose H is a straight line with the gain of `dynamics`."""
         c = np.zeros(law.size)
         c[-1] = dynamics.gain
@@ -179,26 +173,13 @@ class Stage:
             ]
         )
 
-    @functools.cached_property
-    def _powers(self) -> Array:
-        """Map from slopes to the powers v^2, v^3 and v, or v^3 and v; shape (3, 3) or (2, 2)."""
-        low, high = self.law.span
-        if self.law.name == 'plays':
-            # the slope is smallest or largest at zero and at the largest |v|
-            widest = 3.0 * max(-low, high) ** 2
-            return np.array([[-1.0 / widest, 1.0 / widest], [1.0, 0.0]])
-        # slopes of v^2, v^3 and v as Bernstein coefficients over the span
-        ends = np.array([[2.0 * low, 3.0 * low * low, 1.0], [2.0 * high, 3.0 * high * high, 1.0]])
-        middle = np.array([low + high, 3.0 * low * high, 1.0])
-        return np.asarray(np.linalg.inv([ends[0], middle, ends[1]]))
-
     def _sloped(self, c: Array) -> Array:
         """Replace the powers among the coefficients of the law by slopes."""
-        T = self._powers
+        T = _powers(self.law)
         return np.concatenate([c[: -len(T)], np.linalg.solve(T, c[-len(T) :])])
 
     def _unsloped(self, values: Array) -> Array:
-        T = self._powers
+        T = _powers(self.law)
         return np.concatenate([values[: -len(T)], T @ values[-len(T) :]])
 
     def _parts(self) -> list[slice]:
@@ -219,7 +200,7 @@ class Stage:
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the values, shapes (p,)."""
         h, creep, *_, lags, starts = self._parts()
-        p, n = starts.stop, len(self._powers)
+        p, n = starts.stop, len(_powers(self.law))
         lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
         lower[h] = self.law.lower
         slopes = slice(h.stop - n, h.stop)
@@ -236,17 +217,14 @@ class Stage:
     @property
     def rising(self) -> tuple[Array, Array] | None:
         """
-        Rows, shape (k, p), and the smallest product of each row and a step, for which H rises.
+        Rows, shape (k, size), and their smallest products with a step of H for which H rises.
 
         None if the path has no lags: `bounds` then suffice.
         """
         if not self.law.lags:
             return None
-        values, h, T = self.values, self._parts()[0], self._powers
-        rows = np.zeros((self.law.slopes.shape[0], values.size))
-        rows[:, h] = self.law.slopes
-        rows[:, h.stop - len(T) : h.stop] @= T
-        slopes = rows @ values
+        rows = _slopes(self.law)
+        slopes = rows @ self._sloped(self.coefficients)
         return rows, np.minimum(LEAST_SLOPE, slopes) - slopes
 
     @property
@@ -261,7 +239,7 @@ class Stage:
         middle[starts], spread[starts] = self.guesses.ravel(), START_SPREAD
         spread[creep], spread[lags] = CREEP_SPREAD, LAG_SPREAD
         information = np.diag(spread**-2.0)
-        T = len(self._powers)
+        T = len(_powers(self.law))
         bend = np.diff(np.eye(h.stop)[h.stop - T :], axis=0) / SLOPE_CHANGE
         shape = np.vstack([self.law.roughness(DENSITY_SPREAD, DENSITY_CHANGE), bend])
         information[h, h] = shape.T @ shape
@@ -340,7 +318,7 @@ class Stage:
     ) -> Iterator[Array | None]:
         """Yield the derivative of the prediction by each value, shape (n,); None if it is zero."""
         h, w, y = signals
-        T, G = self._powers, self.dynamics
+        T, G = _powers(self.law), self.dynamics
         powers = []
         for j, column in enumerate(self.law.columns(stretch.u, self.memory(stretch))):
             behind = self._behind(column, stretch)
@@ -380,6 +358,26 @@ class Stage:
         """Mark the values that are not on a bound, shape (p,)."""
         lower, upper = self.bounds
         return np.asarray((values > lower + 1e-12) & (values < upper - 1e-12))
+
+
+@functools.lru_cache(maxsize=8)
+def _powers(law: HysteresisLaw) -> Array:
+    """Map slopes to the powers v^2, v^3 and v, or v^3 and v, of a law; shape (3, 3) or (2, 2)."""
+    low, high = law.span
+    if law.name == 'plays':
+        # the slope is smallest or largest at zero and at the largest |v|
+        widest = 3.0 * max(-low, high) ** 2
+        return np.array([[-1.0 / widest, 1.0 / widest], [1.0, 0.0]])
+    # slopes of v^2, v^3 and v as Bernstein coefficients over the span
+    pairs = ((low, low), (low, high), (high, high))
+    return np.asarray(np.linalg.inv([[a + b, 3.0 * a * b, 1.0] for a, b in pairs]))
+
+
+@functools.lru_cache(maxsize=8)
+def _slopes(law: HysteresisLaw) -> Array:
+    """Compute the slopes of H on sweeps by each value of H in a fit; shape (k, size)."""
+    T = _powers(law)
+    return np.hstack([law.slopes[:, : -len(T)], law.slopes[:, -len(T) :] @ T])
 
 
 def memory_of(u0: float, widest: float, shares: Array, thresholds: Array) -> Array:
