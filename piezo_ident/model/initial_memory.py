@@ -328,7 +328,10 @@ def _fit(
             pull = np.sqrt(e.size) * np.append(pull, weak)
             A = np.vstack([np.array([*columns, *others]).T, np.diag(pull)]) @ whole
             target = np.concatenate([e, pull * (rest - state)])
-            step = lsq_linear(A, target, (low - number - margin, high - number + margin)).x
+            # the triangular factor holds the same problem in a few rows
+            R = np.asarray(np.linalg.qr(np.column_stack([A, target]), mode='r'))
+            bounds = low - number - margin, high - number + margin
+            step = lsq_linear(R[:, :-1], R[:, -1], bounds).x
             # a play may begin to move sooner or later than before; the full step then goes too far
             for share in (1.0, 0.5, 0.25, 0.125):
                 trial = np.clip(number + share * step, low, high)
