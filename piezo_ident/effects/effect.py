@@ -104,6 +104,9 @@ class Parameter:
         ModelError
             If the value has the wrong type or is out of bounds; the message starts with `where`.
         """
+        is_number = self.kind == 'number' and not self.vector and isinstance(value, float)
+        if is_number and self.lower <= value <= self.upper:
+            return float(value)  # without arrays, as a fit reads many numbers
         if self.kind == 'text':
             if not isinstance(value, str) or not value:
                 raise ModelError(f'{where}: {self.name} must be a text, got {reprlib.repr(value)}')
