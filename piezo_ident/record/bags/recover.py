@@ -177,8 +177,8 @@ def scanned_bag(path: Path, stack: ExitStack) -> Bag:
         parts += [part] if part.connections else []
     if not parts:
         raise DataError(
-            f'{path}: damaged or unfinished bag, or an empty bag: it holds no whole message; leave '
-            'it out, or record it again'
+            f'{path}: damaged or unfinished bag, or an empty bag: it holds no whole message; '
+            'leave it out, or record it again'
         )
     known: dict[tuple[str, str], Connection] = {}
     for connection in itertools.chain.from_iterable(part.connections for part in parts):
