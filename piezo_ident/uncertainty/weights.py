@@ -65,7 +65,9 @@ def weights_of(errors: Mapping[tuple[str, ...], Sequence[float]]) -> dict[str, f
     weights = dict.fromkeys(names, 0.0)
     for name, w in zip(names, softmax(powers, axis=1).mean(axis=0), strict=True):
         weights[name] += float(w)
-    return dict(sorted(weights.items(), key=lambda item: -item[1]))
+    # rounding must not leave a weight above one
+    total = sum(weights.values())
+    return {k: w / total for k, w in sorted(weights.items(), key=lambda item: -item[1])}
 
 
 def _prior(changes: tuple[str, ...]) -> float:

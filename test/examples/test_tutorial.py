@@ -56,9 +56,9 @@ def test_the_cells_give_what_the_page_shows(tutorial, tmp_path, monkeypatch, bla
         shown.append(said)
         figures += figure is not None
         if expected:
-            # other processors round otherwise
+            # other processors, and another number of threads, round otherwise: 0.040 or 0.045 %
             stale = f'run python docs/refresh_tutorial.py:\n{expected}\n{said}'
-            assert numbers(said) == pytest.approx(numbers(expected), rel=0.1, abs=2e-3), stale
+            assert numbers(said) == pytest.approx(numbers(expected), rel=0.2, abs=2e-3), stale
     # results and pictures show themselves, and the story is that of the page
     assert figures >= 5
     assert any(said.startswith('Slew limit explains') for said in shown)
