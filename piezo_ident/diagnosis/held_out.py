@@ -1,15 +1,19 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Choose the blocks that are held out together: blocks of one label, or of similar motion."""
+"""Choose the blocks that are held out together, and the errors that they show."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers
+from piezo_ident.common.arrays import Array, Integers, Mask
+from piezo_ident.diagnosis.criteria import MOVED_ZERO
+from piezo_ident.model.initial_memory import fit_start
+from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece
 from piezo_ident.selection.judged import JudgedRun
 from piezo_ident.selection.motion_kinds import description, interleaved, KINDS, kinds_of
@@ -57,6 +61,29 @@ def errors_of_segments(runs: Iterable[JudgedRun]) -> dict[str, Array]:
         for label, start, stop in stretches(run.record, run.piece):
             found.setdefault(label, []).append(run.error[start:stop][run.use[start:stop]])
     return {label: np.concatenate(parts) for label, parts in found.items()}
+
+
+def unseen_runs(model: StageModel, parts: Iterable[tuple[str, Piece, Mask]]) -> list[JudgedRun]:
+    """Run a model as on unseen records, at the zero of each record."""
+    runs = []
+    for record, piece, use in parts:
+        y = model.predict_piece(piece, fit_start(model, piece, use))
+        runs.append(JudgedRun(record, piece, y, use, np.zeros(y.size, dtype=bool)))
+    moved = {}
+    for name in {run.record for run in runs}:
+        e = np.concatenate([run.error[run.use] for run in runs if run.record == name])
+        is_clear = e.size and abs(e.mean()) > MOVED_ZERO * e.std()
+        moved[name] = float(e.mean()) if is_clear else 0.0
+    return [replace(run, predicted=run.predicted + moved[run.record]) for run in runs]
+
+
+def excess(runs: Sequence[JudgedRun], held_out: Mapping[str, float]) -> dict[str, float]:
+    """Compute by how much held-out squared errors exceed fitted ones, by segment [m^2]."""
+    return {
+        label: max(held_out[label] - float(e.var()), 0.0)
+        for label, e in errors_of_segments(runs).items()
+        if label in held_out
+    }
 
 
 def held_out_kinds(

@@ -124,7 +124,8 @@ def sentence(result: Diagnosis) -> str:
         texts.append(f'{hidden} may hide in that hysteresis, and these data do not tell')
     elif result.group and result.verdict == 'partly_explained':
         texts.append(f'whether it is {_or(result.group.names)}, these data do not tell')
-    if result.promise:
+    # a measured error on an unseen record says more than a promise
+    if result.promise and not result.unseen:
         texts.append(f'another record will show {result.promise.told}')
     if result.outside:
         low, high = result.given.scaling.range

@@ -166,7 +166,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         ('verdict', result.verdict.replace('_', ' ')),
         ('model', ', '.join(result.changes) or 'stays as given'),
         *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
-        *(('another record', p.told) for p in [result.promise] if p),
+        *(('another record', p.told) for p in [result.promise] if p and not result.unseen),
         ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
     ]

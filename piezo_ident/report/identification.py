@@ -69,17 +69,17 @@ def facts(result: Identification) -> list[tuple[str, str]]:
     samples = f'{delay.samples} ± {number(delay.std, 2)} samples'
     if delay.source == 'given':
         samples = f'{delay.samples} samples (given)'
-    lag = 1e6 * model.delay.total / model.sample_rate
+    is_validated = result.headline.data == 'validation'
     texts = {
         'stroke': length(result.stroke),
         'voltage': f'{low:g} .. {high:g} V',
         'direction': 'retracts with rising voltage' if model.scaling.Y < 0.0 else '',
         'sampling rate': f'{model.sample_rate:g} Hz',
-        'delay': f'{samples} = {lag:.4g} µs',
+        'delay': f'{samples} = {1e6 * model.delay.total / model.sample_rate:.4g} µs',
         'dynamics': f'na = {na}, nb = {nb}' if na else 'G = 1',
         'hysteresis': _law(result),
         'error holds': _stands_for(result),
-        'another record': result.promise.told if result.promise else '',
+        'another record': result.promise.told if result.promise and not is_validated else '',
         'sensor noise': 'unknown' if floor is None else f'{number(floor)} % of stroke rms',
         'effects': ', '.join(effect.name for effect in model.effects),
     }

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.results import Diagnosis, Unseen
 from piezo_ident.identification.warnings import LAW_WORDS
 from piezo_ident.model.free_run import FreeRun, same_part_errors
@@ -40,7 +41,8 @@ def validated(
 
 def _judged(result: Diagnosis, parts: Iterable[tuple[Record, FreeRun | None]]) -> Diagnosis:
     """Add the errors on records; a run of shared modes replaces the run of the refined model."""
-    return replace(result, unseen=(*result.unseen, *(_unseen(result, *x) for x in parts)))
+    result = replace(result, unseen=(*result.unseen, *(_unseen(result, *x) for x in parts)))
+    return replace(result, sentence=sentence(result))
 
 
 def _unseen(result: Diagnosis, record: Record, refined: FreeRun | None) -> Unseen:

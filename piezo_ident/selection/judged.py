@@ -74,8 +74,8 @@ class Promise:
 
     `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
     within the swings and speeds of these records.  `other` is None (unknown) if every segment of
-    motion was fitted.  Hum, drift and other effects of time count in full, because another record
-    has them and the model lacks them.
+    motion was fitted, or if all motion is of one kind.  Hum, drift and other effects of time count
+    in full, because another record has them and the model lacks them.
     """
 
     same: float
@@ -87,6 +87,6 @@ class Promise:
         if self.other is None:
             return (
                 f'{self.same:.3g} % of stroke on such motion; the error on another kind of motion '
-                'is not known, as every segment was fitted: play `identification_loops`'
+                'is not known, as no other kind was held out: play `identification_loops`'
             )
         return f'{self.same:.3g} % of stroke, {self.other:.3g} % on another kind of motion'

@@ -5,9 +5,10 @@
 Promise the error of another record, and give the model its prediction band.
 
 The promise for the same kinds of motion is the rms error of the model on its records, raised to
-the error of held-out samples.  The promise for motion of another kind is the geometric mean of q
-times the geometric mean of r_k (`piezo_ident.uncertainty.band`), over all pairs of a swing, with
-its nesting, of one kind and a speed of another kind.  About half of the kinds err more.
+the error of held-out samples, and to the error without a fitted start.  The promise for motion of
+another kind is the geometric mean of q times the geometric mean of r_k
+(`piezo_ident.uncertainty.band`), over all pairs of a swing, with its nesting, of one kind and a
+speed of another kind.  About half of the kinds err more.
 
 After a diagnosis the refined model carries no hum, drift or wandering gain: they count in full.
 
@@ -17,24 +18,24 @@ records.  A zero of the sensor that has clearly moved does not count.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import MOVED_ZERO
-from piezo_ident.diagnosis.held_out import errors_of_segments
+from piezo_ident.diagnosis.held_out import errors_of_segments, excess, unseen_runs
 from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.identification.results import Identification
-from piezo_ident.model.initial_memory import fit_start
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.selection.judged import Judged, JudgedRun, Promise
+from piezo_ident.selection.judged import Judged, Promise
 from piezo_ident.uncertainty.band import KEY, PredictionBand
 from piezo_ident.uncertainty.calibration import Blocks, blocks_of, calibrated
 from piezo_ident.uncertainty.parameters import QUANTITIES
 from piezo_ident.uncertainty.weights import weights_of
+
+#: kinds whose swings and speeds differ by less than this factor are one kind of motion (taste)
+OCTAVE = 2.0
 
 
 def with_band(model: StageModel, band: PredictionBand) -> StageModel:
@@ -44,7 +45,14 @@ def with_band(model: StageModel, band: PredictionBand) -> StageModel:
 
 def promised_identification(result: Identification, judged: Judged) -> Identification:
     """Add promise and band to an identification."""
-    model, blocks = result.model, blocks_of(result.model, judged.runs)
+    model = result.model
+    alone = unseen_runs(model, ((r.record, r.piece, r.use) for r in judged.runs))
+    own, more = (
+        {label: float(np.sum(e**2)) / max(e.size, 1) for label, e in errors_of_segments(x).items()}
+        for x in (judged.runs, alone)
+    )
+    # another record lacks the fitted start of these runs
+    blocks = blocks_of(model, judged.runs, {k: max(x - own[k], 0.0) for k, x in more.items()})
     if blocks is None:
         return result
     band = calibrated(blocks)
@@ -58,7 +66,8 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     """Add weights, promise and band to a diagnosis, and the promise to its sentence."""
     model = result.model
     result = replace(result, weights=weights_of(result.errors_of_sets))
-    runs, fit, stroke = _elsewhere(result), result.runs, result.stroke
+    fit, stroke = result.runs, result.stroke
+    runs = unseen_runs(model, ((r.record, r.piece, r.sound) for r in result.residuals))
     same, other = (
         blocks_of(model, runs, excess(fit, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))
         for e in (result.held_out.by_segment if result.held_out else {}, result.after.by_segment)
@@ -81,30 +90,10 @@ def promise_of(
     """Promise the error of another record, from blocks of the same kinds and of other kinds."""
     mean = float(np.average(same.square, weights=same.weight))
     swing, speed, nesting = (np.sqrt(other.of_kinds(other.motion[:, i])) for i in (1, 2, 3))
+    same_motion = percent(span * math.sqrt(mean), stroke)
+    if all(x.max() < OCTAVE * x.min() for x in (swing, speed)):
+        return Promise(same_motion, None)
     k, m = (x.ravel() for x in np.indices((other.kinds, other.kinds)))
     scales = band.scale(np.array([swing[k], speed[m], nesting[k]]))
     expected = math.exp(float(np.mean(np.log(scales)) + np.mean(np.log(band.ratios))))
-    return Promise(percent(span * math.sqrt(mean), stroke), percent(span * expected, stroke))
-
-
-def _elsewhere(result: Diagnosis) -> list[JudgedRun]:
-    """Run the refined model as on unseen records, at the zero of each record."""
-    runs = []
-    for r in result.residuals:
-        y = result.model.predict_piece(r.piece, fit_start(result.model, r.piece, r.sound))
-        runs.append(JudgedRun(r.record, r.piece, y, r.sound, np.zeros(y.size, dtype=bool)))
-    moved = {}
-    for name in result.records:
-        e = np.concatenate([run.error[run.use] for run in runs if run.record == name])
-        is_clear = e.size and abs(e.mean()) > MOVED_ZERO * e.std()
-        moved[name] = float(e.mean()) if is_clear else 0.0
-    return [replace(run, predicted=run.predicted + moved[run.record]) for run in runs]
-
-
-def excess(runs: Sequence[JudgedRun], held_out: Mapping[str, float]) -> dict[str, float]:
-    """Compute by how much held-out squared errors exceed fitted ones, by segment [m^2]."""
-    return {
-        label: max(held_out[label] - float(e.var()), 0.0)
-        for label, e in errors_of_segments(runs).items()
-        if label in held_out
-    }
+    return Promise(same_motion, percent(span * expected, stroke))

@@ -10,13 +10,14 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from piezo_ident.diagnosis.held_out import excess
 from piezo_ident.diagnosis.results import Diagnosis
 from piezo_ident.model.metrics import percent
 from piezo_ident.model.multi_axis import SHARED_MODES
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.selection.judged import JudgedRun, Promise
 from piezo_ident.uncertainty.calibration import blocks_of, calibrated
-from piezo_ident.uncertainty.promises import excess, promise_of, with_band
+from piezo_ident.uncertainty.promises import promise_of, with_band
 
 
 def promised_modes(result: Diagnosis, held_out: Mapping[str, float]) -> Diagnosis:

@@ -12,8 +12,10 @@ from piezo_ident import report
 from piezo_ident.diagnosis.results import DiagnosisSettings, REFITTED
 from piezo_ident.identification.results import Settings
 from piezo_ident.record.record import Piece, Record, Segment
+from piezo_ident.report.refined import validated
 from piezo_ident.selection.judged import Judged, JudgedRun, Promise
 from piezo_ident.uncertainty.band import KEY
+from piezo_ident.uncertainty.promises import promised_identification
 from piezo_ident.verbs.learn import diagnose, identify
 import pytest
 
@@ -90,6 +92,36 @@ def test_an_identification_promises_what_the_next_record_shows():
     assert 0.7 < other / result.promise.same < 1.3
     assert result.promise.told in ' '.join(report.identification_text(result).split())
     assert report.to_json(result)['promise']['other_motion'] == result.promise.other
+
+
+def swept(frequency):
+    t = np.arange(6000) / 2000.0
+    v = 5.0 - 5.0 * np.cos(2 * np.pi * frequency(t) * t)
+    y = 1e-6 * v + 1e-7 * np.abs(np.sin(v))
+    noise = 3e-9 * np.random.default_rng(4).standard_normal(v.size)
+    return Record.from_arrays(v, y + noise, sample_rate=2000.0)
+
+
+def test_what_a_fitted_start_explains_is_not_promised():
+    record = swept(lambda t: 1.0 + t)
+    result = identify(record, Settings(thresholds=6, order=(2, 2), delay=0))
+    (piece,), use = record.pieces, np.ones(record.n, dtype=bool)
+    # with the start of its own record the model errs by nothing
+    run = JudgedRun(record.name, piece, piece.y, use, np.arange(record.n) > 3000)
+    promise = promised_identification(result, Judged((run,))).promise
+    assert 0.8 < promise.same / result.model.score(record).percent < 1.25
+
+
+def test_one_frequency_promises_nothing_of_other_motion():
+    settings = Settings(thresholds=6, order=(2, 2), delay=0)
+    assert identify(swept(lambda t: 5.0), settings).promise.other is None
+    assert identify(swept(lambda t: 1.0 + t), settings).promise.other is not None
+
+
+def test_a_measured_error_replaces_the_promise_of_a_diagnosis():
+    result = validated(diagnosis(0.0), [record(0.0, seed=1)])
+    text = ' '.join(report.diagnosis_text(result).split())
+    assert result.promise.told not in text and result.unseen[0].record in text
 
 
 def test_where_every_motion_was_fitted_the_error_of_other_motion_is_not_known():
