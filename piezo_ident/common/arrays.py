@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,12 +25,26 @@ _LONE, _STEPS = 0.25, 4.0
 
 def frozen_array(values: ArrayLike) -> Array:
     """Return `values` as a read-only float64 vector, copied only when it must be."""
-    array = np.asarray(values, dtype=np.float64)
+    array = real_array(values)
     if array.flags.writeable:
         # a view would leave the data open to its owner, so only already frozen arrays are shared
         array = array.copy()
         array.setflags(write=False)
     return array
+
+
+def real_array(values: ArrayLike) -> Array:
+    """
+    Return numbers as float64, with NaN for a masked one; TypeError or ValueError for others.
+
+    >>> real_array(np.ma.array([1, 2, 3], mask=[False, True, False]))
+    array([ 1., nan,  3.])
+    """
+    # a plain array, which has no mask, is not copied
+    if type(values) is not np.ndarray:
+        masked: Any = np.ma.asarray(values)
+        values = masked.astype(np.float64).filled(np.nan)
+    return np.asarray(values, dtype=np.float64)
 
 
 def true_runs(mask: Mask) -> list[tuple[int, int]]:

@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, real_array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.expectation import known_rms
 from piezo_ident.model.stage_model import StageModel
@@ -46,9 +45,9 @@ def check_rate(rate: float, sample_rate: float | None) -> None:
 def _vector(values: ArrayLike) -> Array:
     """Convert numbers to a vector, with NaN for a masked number; empty for other values."""
     try:
-        given: Any = np.ma.asarray(values)
-        if given.ndim == 1 and np.isrealobj(given):
-            return np.asarray(given.astype(np.float64).filled(np.nan))
+        x = real_array(values)
+        if x.ndim == 1 and np.isrealobj(values):
+            return x
     except (TypeError, ValueError):
         pass
     return np.empty(0)

@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, interpolated
+from piezo_ident.common.arrays import Array, interpolated, real_array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.inputs import FAR
 from piezo_ident.control.inverse import Inverse, invert
@@ -193,7 +193,7 @@ class Learning:
         """Correct the reference as `take` does; the drive stays."""
         drive = self.drive
         try:
-            y = np.asarray(measured, dtype=np.float64)
+            y = real_array(measured)
         except (TypeError, ValueError):
             y = np.empty(0)
         if y.shape != drive.v.shape or not np.all(np.isfinite(y)):

@@ -18,7 +18,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, Mask, real_array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.effects import find_effect
 from piezo_ident.effects.creep import Creep
@@ -245,7 +245,7 @@ class StageModel(FrontDoor):
         '71.3 um'
         """
         try:
-            x = np.asarray(v, dtype=np.float64)
+            x = real_array(v)
         except (TypeError, ValueError):
             x = np.array(np.nan)
         if x.ndim != 1 or not np.all(np.isfinite(x)):

@@ -17,7 +17,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, true_runs
+from piezo_ident.common.arrays import Array, real_array, true_runs
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
@@ -120,7 +120,7 @@ def _table(
         raise DataError(f'{name}: a further channel is called {min(taken)}; give it another name')
     for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
         try:
-            columns |= {} if values is None else {key: np.asarray(values, dtype=np.float64)}
+            columns |= {} if values is None else {key: real_array(values)}
         except (TypeError, ValueError):
             raise DataError(f'{name}: column {key!r} holds something else than numbers') from None
     shapes = {k: x.shape for k, x in columns.items()}

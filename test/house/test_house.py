@@ -50,7 +50,7 @@ ROOMS = (
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
     'cli': (2100, 12),
-    'common': (900, 8),
+    'common': (1000, 8),
     'excitation': (1100, 6),
     'identification': (4400, 18),
     'live': (3900, 16),

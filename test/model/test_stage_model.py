@@ -167,3 +167,10 @@ def test_simulate_starts_from_rest_or_from_the_memory_given():
     for wrong in ([[1.0, 2.0]], [1.0, np.nan], 3.0):
         with pytest.raises(DataError, match='voltage'):
             PAPER.simulate(wrong)
+
+
+def test_simulate_refuses_a_masked_voltage():
+    v = np.ma.masked_greater(np.linspace(0, 10, 100), 5.0)
+    with pytest.raises(DataError, match='finite numbers'):
+        PAPER.simulate(v)
+    assert np.array_equal(PAPER.simulate(v[:20]), PAPER.simulate(v.data[:20]))

@@ -401,3 +401,12 @@ def test_nicest_rate_wins():
     assert fit_clock(t, Resolution.of(t)).sample_rate == 5000
     t = np.arange(2000) * 3e-4
     assert fit_clock(t, Resolution.of(t)).sample_rate == 1 / 3e-4
+
+
+def test_a_masked_reading_is_no_reading():
+    bad = (np.arange(500) // 50) % 5 == 2
+    t, v, y = columns(500)
+    masked = read([t, v, np.ma.array(np.where(bad, 1.02 * y, y), mask=bad)])
+    unknown = read([t, v, np.where(bad, np.nan, y)])
+    assert masked.faults == unknown.faults != ()
+    assert sizes(masked) == sizes(unknown)

@@ -41,7 +41,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, real_array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.modes.kernels import Loop, LoopState, Passage, trajectory
 from piezo_ident.model.modes.modal import Modal
@@ -188,7 +188,7 @@ class SharedModes:
     def of_axes(self, v: Mapping[str, ArrayLike]) -> dict[str, Array]:
         """Simulate the axes in alphabetical order; voltages [V], displacements [m] by axis."""
         order = sorted(v)
-        columns = np.column_stack([np.asarray(v[axis], dtype=np.float64) for axis in order])
+        columns = np.column_stack([real_array(v[axis]) for axis in order])
         return dict(zip(order, self.simulate(columns).T, strict=True))
 
     @property
