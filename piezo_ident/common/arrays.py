@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from piezo_ident.common.errors import DataError
 
 #: real numbers, which ones count, and places
 Array = NDArray[np.float64]
@@ -21,11 +22,16 @@ CHUNK = 1 << 20
 #: share of the range, and multiple of the usual step between two numbers, by which one without
 #: neighbours may leave the range
 _LONE, _STEPS = 0.25, 4.0
+#: types that numpy would turn into wrong numbers
+_CURES = {
+    'c': 'give its real part',
+    **dict.fromkeys('mM', "give seconds, as in (t - t[0]) / np.timedelta64(1, 's')"),
+}
 
 
-def frozen_array(values: ArrayLike) -> Array:
-    """Return `values` as a read-only float64 vector, copied only when it must be."""
-    array = real_array(values)
+def frozen_array(values: ArrayLike, where: str = 'array') -> Array:
+    """Return `values` as a read-only `real_array`, copied only when it must be."""
+    array = real_array(values, where)
     if array.flags.writeable:
         # a view would leave the data open to its owner, so only already frozen arrays are shared
         array = array.copy()
@@ -33,18 +39,25 @@ def frozen_array(values: ArrayLike) -> Array:
     return array
 
 
-def real_array(values: ArrayLike) -> Array:
+def real_array(values: ArrayLike, where: str = 'array') -> Array:
     """
-    Return numbers as float64, with NaN for a masked one; TypeError or ValueError for others.
+    Return real numbers as float64, with NaN for a masked one; DataError names what is no number.
 
     >>> real_array(np.ma.array([1, 2, 3], mask=[False, True, False]))
     array([ 1., nan,  3.])
     """
-    # a plain array, which has no mask, is not copied
-    if type(values) is not np.ndarray:
-        masked: Any = np.ma.asarray(values)
-        values = masked.astype(np.float64).filled(np.nan)
-    return np.asarray(values, dtype=np.float64)
+    got: object = type(values).__name__
+    cure = 'give one number a sample'
+    try:
+        # a plain array of float64, which has no mask, is not copied
+        given: Any = values if type(values) is np.ndarray else np.ma.asarray(values)
+        got = given.dtype
+        if given.dtype.kind not in _CURES:
+            return np.asarray(np.ma.filled(given.astype(np.float64, copy=False), np.nan))
+        cure = _CURES[given.dtype.kind]
+    except (TypeError, ValueError):
+        pass
+    raise DataError(f'{where}: expected real numbers, got {got}; {cure}')
 
 
 def true_runs(mask: Mask) -> list[tuple[int, int]]:

@@ -25,8 +25,8 @@ FAR, FAINT = 30.0, 2e-3
 
 def checked_motion(wanted: ArrayLike) -> Array:
     """Convert a wanted motion to a vector, or raise DataError."""
-    y = _vector(wanted)
-    if y.size < 2 or not np.all(np.isfinite(y)):
+    y = real_array(wanted, 'invert, wanted motion')
+    if y.ndim != 1 or y.size < 2 or not np.all(np.isfinite(y)):
         raise DataError(
             'invert: the wanted motion must be a vector of finite numbers, in metres, two at least'
         )
@@ -40,17 +40,6 @@ def check_rate(rate: float, sample_rate: float | None) -> None:
             f'the wanted motion is sampled at {sample_rate:g} Hz, the model at {rate:g} Hz; give '
             'the motion at that rate'
         )
-
-
-def _vector(values: ArrayLike) -> Array:
-    """Convert numbers to a vector, with NaN for a masked number; empty for other values."""
-    try:
-        x = real_array(values)
-        if x.ndim == 1 and np.isrealobj(values):
-            return x
-    except (TypeError, ValueError):
-        pass
-    return np.empty(0)
 
 
 def checked_limits(
@@ -73,7 +62,7 @@ def checked_limits(
 
 def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -> dict[str, Array]:
     """Extend further signals to the length of the voltage; DataError if a length is wrong."""
-    found = {name: _vector(z) for name, z in channels.items()}
+    found = {name: real_array(z, f'invert, channel {name!r}') for name, z in channels.items()}
     for name, z in found.items():
         if z.shape != (n,) or not np.all(np.isfinite(z)):
             raise DataError(

@@ -192,10 +192,7 @@ class Learning:
     def learn(self, measured: ArrayLike) -> float:
         """Correct the reference as `take` does; the drive stays."""
         drive = self.drive
-        try:
-            y = real_array(measured)
-        except (TypeError, ValueError):
-            y = np.empty(0)
+        y = real_array(measured, 'learning, measured')
         if y.shape != drive.v.shape or not np.all(np.isfinite(y)):
             raise DataError(
                 f'learning: {y.size} measured samples for {drive.v.size} of voltage; give one '

@@ -244,10 +244,7 @@ class StageModel(FrontDoor):
         >>> f'{1e6 * model.simulate([0.0] * 3 + [10.0] * 997)[-1]:.1f} um'
         '71.3 um'
         """
-        try:
-            x = real_array(v)
-        except (TypeError, ValueError):
-            x = np.array(np.nan)
+        x = real_array(v, 'simulate, voltage')
         if x.ndim != 1 or not np.all(np.isfinite(x)):
             raise DataError('simulate: the voltage must be a vector of finite numbers, in volts')
         if not x.size:

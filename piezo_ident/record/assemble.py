@@ -119,10 +119,8 @@ def _table(
     if taken := {'t', 'v', 'y'} & channels.keys():
         raise DataError(f'{name}: a further channel is called {min(taken)}; give it another name')
     for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
-        try:
-            columns |= {} if values is None else {key: real_array(values)}
-        except (TypeError, ValueError):
-            raise DataError(f'{name}: column {key!r} holds something else than numbers') from None
+        if values is not None:
+            columns[key] = real_array(values, f'{name}: {key}')
     shapes = {k: x.shape for k, x in columns.items()}
     if len(set(shapes.values())) > 1 or columns['t'].ndim != 1:
         lengths = ', '.join(f'{k} {"x".join(map(str, s))}' for k, s in shapes.items())

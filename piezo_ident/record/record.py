@@ -106,8 +106,8 @@ class Piece:
     sound: Mask | None = None
 
     def __post_init__(self) -> None:
-        v, y = frozen_array(self.v), frozen_array(self.y)
-        channels = {name: frozen_array(x) for name, x in self.channels.items()}
+        v, y = frozen_array(self.v, 'v'), frozen_array(self.y, 'y')
+        channels = {k: frozen_array(x, f'channel {k!r}') for k, x in self.channels.items()}
         if v.ndim != 1 or v.size == 0:
             raise DataError('a piece needs at least one sample of voltage and displacement')
         lengths = {'v': v.size, 'y': y.size, **{k: x.size for k, x in channels.items()}}

@@ -169,8 +169,12 @@ def test_simulate_starts_from_rest_or_from_the_memory_given():
             PAPER.simulate(wrong)
 
 
-def test_simulate_refuses_a_masked_voltage():
+def test_simulate_takes_real_numbers_without_a_mask():
     v = np.ma.masked_greater(np.linspace(0, 10, 100), 5.0)
     with pytest.raises(DataError, match='finite numbers'):
         PAPER.simulate(v)
+    with pytest.raises(DataError, match='voltage: expected real numbers, got complex128'):
+        PAPER.simulate(v.data + 1j)
+    with pytest.raises(DataError, match="channel 'heat': expected real numbers, got complex128"):
+        PAPER.simulate(v.data, channels={'heat': v.data + 1j})
     assert np.array_equal(PAPER.simulate(v[:20]), PAPER.simulate(v.data[:20]))

@@ -410,3 +410,19 @@ def test_a_masked_reading_is_no_reading():
     unknown = read([t, v, np.where(bad, np.nan, y)])
     assert masked.faults == unknown.faults != ()
     assert sizes(masked) == sizes(unknown)
+
+
+@pytest.mark.parametrize(
+    ('place', 'kind', 'line'),
+    [
+        (0, 'm8[ns]', r'data: t: expected real numbers, got timedelta64\[ns\]; give seconds'),
+        (0, 'M8[us]', r'data: t: expected real numbers, got datetime64\[us\]; give seconds'),
+        (1, 'c16', 'data: v: expected real numbers, got complex128; give its real part'),
+        (2, 'c8', 'data: y: expected real numbers, got complex64; give its real part'),
+    ],
+)
+def test_types_that_hold_no_real_numbers_are_refused(place, kind, line):
+    c = columns()
+    c[place] = (1e9 * c[place]).astype(kind)
+    with pytest.raises(DataError, match=line):
+        read(c)

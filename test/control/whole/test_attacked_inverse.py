@@ -37,10 +37,10 @@ def circle(radius, angle):
     [
         (SINE * 1e6, {}, r'starts at 1.5e\+07 um; .* in metres\?'),
         (SINE * 1e6, {'clip': True}, r'in metres\?'),
-        (SINE + 1j, {}, 'vector of finite numbers'),
+        (SINE + 1j, {}, 'expected real numbers, got complex128; give its real part'),
         (SINE[None], {}, 'vector of finite numbers'),
         (SINE[:1], {}, 'two at least'),
-        ('abc', {}, 'vector of finite numbers'),
+        ('abc', {}, 'wanted motion: expected real numbers'),
         (np.where(T > 0.1, np.nan, SINE), {}, 'finite'),
         (np.ma.masked_greater(SINE, 50e-6), {}, 'finite'),
         (-SINE, {}, 'starts at -15 um; between 0 and 10 V the stage rests at 0 .. 71'),
