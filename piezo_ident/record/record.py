@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import itertools
+from numbers import Real
 from types import MappingProxyType
 from typing import Any
 
@@ -27,6 +28,8 @@ from piezo_ident.record.clock import time_stamps
 #: kinds of segments in programs; samples with other labels count as unlabelled
 KINDS: tuple[str, ...] = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase')
 KINDS += ('multisine', 'ramp', 'idle')
+#: what to give as further channels
+NAMED = "give an array by name, as in {'v_b': array}"
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,7 @@ class Piece:
 
     def __post_init__(self) -> None:
         v, y = frozen_array(self.v, 'v'), frozen_array(self.y, 'y')
+        expect(self.channels, Mapping, 'channels', NAMED)
         channels = {k: frozen_array(x, f'channel {k!r}') for k, x in self.channels.items()}
         if v.ndim != 1 or v.size == 0:
             raise DataError('a piece needs at least one sample of voltage and displacement')
@@ -286,12 +290,17 @@ class Record(Showable):
         from piezo_ident.record.assemble import assemble
         from piezo_ident.record.options import ReadOptions
 
+        # numpy and MATLAB files hold a rate as an array without axes
+        sample_rate = np.asarray(sample_rate).tolist()
+        if sample_rate is not None:
+            expect(sample_rate, Real, f'{name}: sample_rate', 'give the samples a second')
         if sample_rate is not None and not 0.0 < sample_rate < float('inf'):
             raise DataError(f'{name}: sample_rate must be positive, got {sample_rate} Hz')
         if sample_rate is not None and len(arrays) == 2:
             arrays = (np.arange(np.size(arrays[0])) / sample_rate, *arrays)
         if len(arrays) != 3:
             raise DataError(f'{name}: give t, v and y, or v and y with sample_rate')
+        expect({} if channels is None else channels, Mapping, f'{name}: channels', NAMED)
         options = ReadOptions(displacement_unit, voltage_limits)
         t, v, y = arrays
         return assemble(

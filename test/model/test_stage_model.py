@@ -177,4 +177,6 @@ def test_simulate_takes_real_numbers_without_a_mask():
         PAPER.simulate(v.data + 1j)
     with pytest.raises(DataError, match="channel 'heat': expected real numbers, got complex128"):
         PAPER.simulate(v.data, channels={'heat': v.data + 1j})
+    with pytest.raises(DataError, match='channels: expected Mapping, got list'):
+        PAPER.simulate(v.data, channels=[v.data])
     assert np.array_equal(PAPER.simulate(v[:20]), PAPER.simulate(v.data[:20]))

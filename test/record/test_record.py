@@ -43,6 +43,20 @@ def test_arrays_without_their_time_are_refused(arrays, rate):
         Record.from_arrays(*arrays, sample_rate=rate)
 
 
+@pytest.mark.parametrize(
+    ('wrong', 'line'),
+    [
+        ({'sample_rate': '1000'}, 'mine: sample_rate: expected Real, got str'),
+        ({'sample_rate': [RATE]}, 'mine: sample_rate: expected Real, got list'),
+        ({'sample_rate': RATE, 'channels': [V]}, 'mine: channels: expected Mapping, got list'),
+    ],
+)
+def test_options_of_another_type_are_refused(wrong, line):
+    with pytest.raises(DataError, match=line):
+        Record.from_arrays(V, Y, name='mine', **wrong)
+    assert Record.from_arrays(V, Y, sample_rate=np.array(RATE)).pieces[0].sample_rate == RATE
+
+
 def test_stroke_does_not_count_single_wild_samples():
     y = Y.copy()
     y[[300, 301, 900]] = 5e-3
