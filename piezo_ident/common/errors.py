@@ -5,8 +5,13 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+import dataclasses
 import difflib
+from numbers import Integral, Real
+from typing import Any
 
+#: types of numbers as dataclasses declare them
+_NUMBERS = {'int': (Integral, 'a whole number'), 'float': (Real, 'a number')}
 #: longest message [characters]: it may quote a file
 _LONGEST = 4000
 
@@ -86,6 +91,16 @@ def expect(value: object, kind: type | tuple[type, ...], where: str, hint: str) 
         kinds = kind if isinstance(kind, tuple) else (kind,)
         names = ' or '.join(k.__name__ for k in kinds)
         raise DataError(f'{where}: expected {names}, got {type(value).__name__}; {hint}')
+
+
+def expect_numbers(settings: Any) -> None:
+    """Refuse fields of a dataclass, declared as int or float, of another type by a ConfigError."""
+    for field in dataclasses.fields(settings):
+        declared, _, optional = str(field.type).partition(' | ')
+        kind, noun = _NUMBERS.get(declared, (object, ''))
+        value = getattr(settings, field.name)
+        if not isinstance(value, kind) and not (optional and value is None):
+            raise ConfigError(f'{field.name} must be {noun}, got {value!r}')
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
-from piezo_ident.common.errors import ConfigError, ModelError
+from piezo_ident.common.errors import ConfigError, expect_numbers, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.effects import find_effect
 from piezo_ident.model.stage_model import StageModel
@@ -62,6 +62,7 @@ class DiagnosisSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        expect_numbers(self)
         for name in (*(self.effects or ()), *self.without):
             try:
                 find_effect(name)

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Integral
+from typing import Any, Literal
 
-from piezo_ident.common.errors import ConfigError
+from piezo_ident.common.errors import ConfigError, expect_numbers
 
 Solver = Literal['least_squares', 'swarm']
 #: callback with the name of the step and its share done; it raises `Cancelled` to stop
@@ -73,15 +74,18 @@ class Settings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        sizes = list(self.order or (1, 1))
+        expect_numbers(self)
+        sizes: Any = self.order or (1, 1)
         rules = {
             'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
             'solver': (self.solver in ('least_squares', 'swarm'), 'least_squares or swarm'),
             'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
             'max_order': (1 <= self.max_order <= 50, '1 to 50'),
             'order': (
-                len(sizes) == 2 and all(1 <= n <= 50 for n in sizes),
-                'two numbers of 1 to 50',
+                isinstance(sizes, Sequence)
+                and len(sizes) == 2
+                and all(n in range(1, 51) and isinstance(n, Integral) for n in sizes),
+                'two whole numbers of 1 to 50',
             ),
             'delay': (self.delay is None or 0 <= self.delay <= 10_000, '0 to 10000 samples'),
             'swarm_size': (self.swarm_size >= 2, 'at least 2'),

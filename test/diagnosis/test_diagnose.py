@@ -17,7 +17,7 @@ from diagnosis_examples import measured as example_record
 from diagnosis_examples import played, with_effects
 from diagnosis_examples import refined_model as creeping_model
 import numpy as np
-from piezo_ident.common.errors import Cancelled, IdentificationError
+from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
 from piezo_ident.diagnosis import (
     diagnose,
     DiagnosisSettings,
@@ -154,6 +154,11 @@ def test_a_part_that_is_too_short_is_refused_with_its_length():
     model, record, _ = measured(None, 0.0, 1)
     with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
         diagnose(model, record, DiagnosisSettings(most_samples=1000))
+
+
+def test_a_setting_of_another_type_is_refused():
+    with pytest.raises(ConfigError, match=r'most_effects must be a whole number, got 1\.5'):
+        DiagnosisSettings(most_effects=1.5)
 
 
 @pytest.mark.parametrize('most', [1000, 4321, 6999])
