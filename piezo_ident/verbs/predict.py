@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from numbers import Real
 from typing import overload
 
 from piezo_ident.common.arrays import Array
@@ -83,6 +84,14 @@ def free_run(
     >>> run.errors.percent < 0.01
     True
     """
+    if interval is not None:
+        expect(interval, Real, 'free_run, interval', 'give a level between 0 and 1, as in 0.9')
+    known = model.axes if isinstance(model, MultiAxisModel) else ('y',)
+    if absent := [axis for axis in axes if axis not in known]:
+        raise DataError(
+            f'free_run, axes: the model has no axis {", ".join(absent)}; give a list of '
+            f'{", ".join(known)}'
+        )
     if not isinstance(model, MultiAxisModel):
         run = run_axis(model, record)
         if interval is None:
