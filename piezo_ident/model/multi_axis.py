@@ -259,12 +259,13 @@ class MultiAxisModel:
             raise DataError('simulate: the voltages of the axes differ in length')
         if self.modes is not None:
             return self.modes.of_axes(v)
-        own = {a: self.own(a).simulate(v[a], channels=further) for a in self.axes}
+        chains = {a: self.own(a) for a in self.axes}
+        own = {a: x.simulate(v[a], channels=x.used(further)) for a, x in chains.items()}
         moved = {motion_of(a): m for a, m in own.items()}
         return {
             axis: own[axis]
-            if model.effects == self.own(axis).effects
-            else model.simulate(v[axis], channels={**further, **moved})
+            if model.effects == chains[axis].effects
+            else model.simulate(v[axis], channels=model.used({**further, **moved}))
             for axis, model in self.axes.items()
         }
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 import warnings
 
 import numpy as np
@@ -29,6 +29,8 @@ from piezo_ident.operators.chain import Block, Chain, Operator, Slot
 from piezo_ident.operators.dynamics import Delay, DelayOperator, Dynamics, DynamicsOperator
 from piezo_ident.operators.hysteresis import Hysteresis, HysteresisOperator
 from piezo_ident.record.record import Piece, Record
+
+T = TypeVar('T')
 
 #: share of the identified range below which a wrong unit is more likely than a small signal
 FAINT = 2e-3
@@ -121,6 +123,10 @@ class StageModel(FrontDoor):
     def is_static(self) -> bool:
         """Whether the model is H and a gain alone, and so holds at any sampling rate."""
         return self.dynamics.is_static and self.delay.total == 0.0 and not self.effects
+
+    def used(self, channels: Mapping[str, T]) -> dict[str, T]:
+        """Select the further signals that effects of the model depend on."""
+        return {e.channel: channels[e.channel] for e in self.effects if e.channel in channels}
 
     def without_dynamics(self) -> StageModel:
         """Reduce the model to its hysteresis, times the static gain of G."""
@@ -219,7 +225,7 @@ class StageModel(FrontDoor):
         v : array_like, shape (n,)
             Voltage [V], sampled at `sample_rate`; the stage is at rest under the first sample.
         channels : mapping of str to array_like, shape (n,), optional
-            Further signals that effects of the model depend on.
+            Further signals that effects of the model depend on; others cost a warning.
         start : Start, or array_like of shape (m,) or (m + k,), optional
             Play outputs before the first sample, normalised, and behind them the lags along the
             path.  By default these belong to a stage that last came down to zero.  A
@@ -250,7 +256,11 @@ class StageModel(FrontDoor):
         if not x.size:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
-        for warning in self.extrapolation(Record((piece,), 'simulate')):
+        if not all(np.isfinite(z).all() for z in piece.channels.values()):
+            raise DataError('simulate: each channel must be a vector of finite numbers')
+        unused = sorted(piece.channels.keys() - self.used(piece.channels).keys())
+        doubts = [f'simulate: no effect of the model uses the channel {k}' for k in unused]
+        for warning in (*doubts, *self.extrapolation(Record((piece,), 'simulate'))):
             warnings.warn(warning, stacklevel=2)
         return self.stream(start).follow(piece)
 

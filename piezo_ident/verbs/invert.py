@@ -150,7 +150,8 @@ def invert(
             beside = {**(channels or {}), **others}
             inverses[axis] = invert_axis(x, goals[axis], channels=beside, **options)
         for axis, one in inverses.items():
-            y = model.own(axis).simulate(one.v, channels=_led(channels, one.lead))
+            own = model.own(axis)
+            y = own.simulate(one.v, channels=own.used(_led(channels, one.lead)))
             moved[axis] = y[one.lead :]
         if last and all(_alike(last[k], inverses[k], model.axes[k].scaling.V) for k in inverses):
             break

@@ -180,3 +180,12 @@ def test_simulate_takes_real_numbers_without_a_mask():
     with pytest.raises(DataError, match='channels: expected Mapping, got list'):
         PAPER.simulate(v.data, channels=[v.data])
     assert np.array_equal(PAPER.simulate(v[:20]), PAPER.simulate(v.data[:20]))
+
+
+def test_simulate_warns_of_a_channel_that_nothing_uses():
+    v = np.linspace(0, 10, 100)
+    with pytest.warns(UserWarning, match=r'no effect of the model uses the channel heat$'):
+        y = PAPER.simulate(v, channels={'heat': v})
+    assert_array_equal(y, PAPER.simulate(v))
+    with pytest.raises(DataError, match='channel must be a vector of finite numbers'):
+        PAPER.simulate(v, channels={'heat': np.ma.masked_greater(v, 5.0)})
