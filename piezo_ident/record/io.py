@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 import re
 from typing import Any, BinaryIO
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, did_you_mean
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
@@ -92,6 +92,11 @@ def read(path: str | Path, options: ReadOptions | None = None, **choices: Any) -
     >>> record.n, round(1e6 * record.stroke)
     (2000, 15)
     """
+    known = [field.name for field in fields(ReadOptions)]
+    for name in choices.keys() - known:
+        # other functions of the package say sample_rate
+        guess = did_you_mean(name.removeprefix('sample_'), known)
+        raise DataError(f'read: no option {name}; {guess or "give " + ", ".join(known)}')
     options = replace(options or ReadOptions(), **choices)
     path = Path(path)
     suffix = path.suffix.lower()

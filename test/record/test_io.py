@@ -366,6 +366,15 @@ def test_pickled_objects_are_refused(tmp_path):
     refuse(path, 'save it again')
 
 
+@pytest.mark.parametrize(
+    ('option', 'cure'),
+    [('sample_rate', 'did you mean rate'), ('colums', 'did you mean columns'), ('x', 'give disp')],
+)
+def test_an_unknown_option_is_refused_with_the_one_that_was_meant(option, cure):
+    with pytest.raises(DataError, match=f'read: no option {option}; {cure}'):
+        pi.read('r.csv', **{option: 1000.0})
+
+
 def test_array_that_announces_too_much(tmp_path):
     path = tmp_path / 'r.npz'
     np.savez(path, **table())
