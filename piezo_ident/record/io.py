@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError, did_you_mean
+from piezo_ident.common.errors import DataError, did_you_mean, expect
 from piezo_ident.common.files import broken_link, check_regular, temporary_output
 from piezo_ident.record.assemble import assemble
 from piezo_ident.record.bags.read import read_bag
@@ -225,6 +225,7 @@ def write(
     >>> pi.read('minor_loops.npz').n == record.n
     True
     """
+    expect(record, Record, 'write, first argument', 'a model has the method save')
     path = Path(path)
     suffix = path.suffix.lower()
     _check_labels(record, path)

@@ -375,6 +375,12 @@ def test_an_unknown_option_is_refused_with_the_one_that_was_meant(option, cure):
         pi.read('r.csv', **{option: 1000.0})
 
 
+def test_a_model_is_no_record_to_write(tmp_path):
+    model = pi.SimulatedStage.load('paper').model
+    with pytest.raises(DataError, match=r'expected Record, got StageModel; .* method save'):
+        pi.write(model, tmp_path / 'model.yaml')
+
+
 def test_array_that_announces_too_much(tmp_path):
     path = tmp_path / 'r.npz'
     np.savez(path, **table())
