@@ -22,6 +22,7 @@ CHUNK = 1 << 20
 #: share of the range, and multiple of the usual step between two numbers, by which one without
 #: neighbours may leave the range
 _LONE, _STEPS = 0.25, 4.0
+_FLOAT = np.dtype(np.float64)
 #: types that numpy would turn into wrong numbers
 _CURES = {
     'c': 'give its real part',
@@ -46,11 +47,13 @@ def real_array(values: ArrayLike, where: str = 'array') -> Array:
     >>> real_array(np.ma.array([1, 2, 3], mask=[False, True, False]))
     array([ 1., nan,  3.])
     """
+    # the common case costs nothing, for streams in small blocks
+    if type(values) is np.ndarray and values.dtype == _FLOAT:
+        return values
     got: object = type(values).__name__
     cure = 'give one number a sample'
     try:
-        # a plain array of float64, which has no mask, is not copied
-        given: Any = values if type(values) is np.ndarray else np.ma.asarray(values)
+        given: Any = np.ma.asarray(values)
         got = given.dtype
         if given.dtype.kind not in _CURES:
             return np.asarray(np.ma.filled(given.astype(np.float64, copy=False), np.nan))

@@ -252,7 +252,9 @@ class StageModel(FrontDoor):
         """
         x = real_array(v, 'simulate, voltage')
         if x.ndim != 1 or not np.all(np.isfinite(x)):
-            raise DataError('simulate: the voltage must be a vector of finite numbers, in volts')
+            raise DataError(
+                'simulate: the voltage must be a vector of finite numbers in volts, none masked'
+            )
         if not x.size:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]

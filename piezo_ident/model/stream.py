@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, line_between
+from piezo_ident.common.arrays import Array, line_between, real_array
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 from piezo_ident.operators.hysteresis import HysteresisOperator
@@ -137,7 +137,7 @@ class Stream:
         The time [s] is counted from the first sample by default.  `channels` are further measured
         signals.
         """
-        x = np.asarray(v, dtype=np.float64)
+        x = real_array(v, 'stream, voltage')
         if x.size == 0:
             return np.empty(0)
         if not self._started:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.model.stream import CHUNK
 from piezo_ident.operators.chain import Block
@@ -177,3 +177,10 @@ def test_very_long_delay_in_short_blocks():
 
 
 PAPER_UNDELAYED = replace(PAPER, delay=Delay(0))
+
+
+def test_a_stream_takes_real_numbers_alone():
+    with pytest.raises(DataError, match='stream, voltage: expected real numbers, got complex128'):
+        PAPER.stream().process(np.ones(100) + 1j)
+    masked = np.ma.masked_greater(np.linspace(0, 10, 100), 9.0)
+    assert np.isnan(PAPER.stream().process(masked)[-1])
