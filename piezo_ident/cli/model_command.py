@@ -18,6 +18,7 @@ from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.files import (
     check_order,
     check_output,
+    check_suffix,
     data_of,
     print_faults,
     read_all,
@@ -29,7 +30,7 @@ from piezo_ident.common.files import write_text
 from piezo_ident.model.axes_file import load
 from piezo_ident.model.axis_records import is_measured, voltage_of
 from piezo_ident.model.free_run import FreeRun
-from piezo_ident.model.multi_axis import each_of, models_of, MultiAxisModel
+from piezo_ident.model.multi_axis import each_of, EachAxis, files_of, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.channels import role_of
 from piezo_ident.record.io import write_columns
@@ -49,23 +50,25 @@ SUFFIXES = {'c': '.h', 'fmu': '.fmu'}
 
 def _checked(args: SimpleNamespace, what: str) -> StageModel | MultiAxisModel:
     """Load the model; refuse outputs that cannot be written, and files in the wrong order."""
-    for path, suffixes, content in (
-        (args.out, TABLE_FILES, what),
-        (args.plot, ENDINGS, 'a picture'),
-    ):
-        if path is not None:
-            inputs = args.model, args.record
-            check_output(path, suffixes, content, inputs=inputs, overwrite=args.overwrite)
+    checks: dict[str, Any] = {'inputs': (args.model, args.record), 'overwrite': args.overwrite}
+    if args.out is not None:
+        check_output(args.out, TABLE_FILES, what, **checks)
     check_order(args.model, args.record, args.verb)
-    return load(args.model)
+    model = load(args.model)
+    if args.plot is not None:
+        check_suffix(args.plot, ENDINGS, 'a picture')
+        for path in files_of(model, args.plot).values():
+            check_output(path, ENDINGS, 'a picture', **checks)
+    return model
 
 
-def _wrote(args: SimpleNamespace, console: Console) -> dict[str, str | None]:
-    """Print the written files; return them for JSON."""
-    files: dict[str, Path | None] = {'out': args.out, 'plot': args.plot}
-    for path in filter(None, files.values()):
+def _wrote(args: SimpleNamespace, result: object, console: Console) -> dict[str, Any]:
+    """Print the written files; return them for JSON, several pictures as a list."""
+    plots = [str(path) for path in files_of(result, args.plot).values()] if args.plot else []
+    out = None if args.out is None else str(args.out)
+    for path in filter(None, (out, *plots)):
         console.say(f'wrote {path}')
-    return {key: None if path is None else str(path) for key, path in files.items()}
+    return {'out': out, 'plot': plots if plots[1:] else next(iter(plots), None)}
 
 
 def predict_command(args: SimpleNamespace, console: Console) -> None:
@@ -78,6 +81,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     known = [axis for axis in models_of(model) if is_measured(record, axis)]
     pieces: dict[str, Sequence[Array]] = {}
     halves: dict[str, Sequence[Array]] = {}
+    run: FreeRun | EachAxis[FreeRun] | None = None
     if known:
         with naming(str(args.model)):
             run = free_run(model, record, args.interval, known)
@@ -126,7 +130,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
                     columns[f'half_width{axis[1:]}'] = halves[axis]
             _write_prediction(record, columns, args.out)
     print_faults(record, (), console)
-    console.result({**data, **data_of(record), **_wrote(args, console)})
+    console.result({**data, **data_of(record), **_wrote(args, run, console)})
 
 
 def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], path: Path) -> None:
@@ -199,7 +203,7 @@ def invert_command(args: SimpleNamespace, console: Console) -> None:
             'reference': str(args.record),
             **to_json(next(iter(axes.values()))),
             'axes': {axis: to_json(x) for axis, x in axes.items()},
-            **_wrote(args, console),
+            **_wrote(args, drive, console),
         }
     )
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 import os
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, TYPE_CHECKING, TypeVar
 
@@ -291,6 +292,13 @@ class MultiAxisModel:
 def each_of(result: T | EachAxis[T]) -> Mapping[str, T]:
     """List the result of each axis; the one of a stage of one axis is ``y``."""
     return result if isinstance(result, EachAxis) else {'y': result}
+
+
+def files_of(result: object, path: Path) -> dict[str, Path]:
+    """Name a file for each axis of a result or model; that of a stage of one axis is `path`."""
+    if not isinstance(result, EachAxis | MultiAxisModel):
+        return {'y': path}
+    return {axis: path.with_name(f'{path.stem}_{axis}{path.suffix}') for axis in result.axes}
 
 
 def mapped(result: T | EachAxis[T], change: Callable[[str, T], T]) -> T | EachAxis[T]:

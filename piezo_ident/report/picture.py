@@ -14,7 +14,7 @@ from piezo_ident.common.errors import ConfigError
 from piezo_ident.common.files import temporary_output
 from piezo_ident.model.free_run import FreeRun, PieceRun
 from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
-from piezo_ident.model.multi_axis import EachAxis
+from piezo_ident.model.multi_axis import EachAxis, files_of
 from piezo_ident.record.record import Record
 from piezo_ident.report.html import Shown, summary_html
 from piezo_ident.report.table import length, number, plain_text, Table
@@ -103,13 +103,10 @@ def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> N
         raise ConfigError(f'{path}: a picture ends in {", ".join(ENDINGS)}')
     from piezo_ident.report.figures import style
 
-    if isinstance(result, EachAxis):
-        for axis, x in result.items():
-            save_plot(x, target.with_name(f'{target.stem}_{axis}{target.suffix}'))
-        return
-    drawn = plot(result)
-    with temporary_output(target, overwrite=True) as file:
-        drawn.savefig(file, dpi=style.DPI)
+    for axis, place in files_of(result, target).items():
+        drawn = plot(result[axis] if isinstance(result, EachAxis) else result)
+        with temporary_output(place, overwrite=True) as file:
+            drawn.savefig(file, dpi=style.DPI)
 
 
 def to_text(result: Result) -> str:

@@ -8,7 +8,7 @@ import json
 from zipfile import ZipFile
 
 from axes_scanner import play, raster, scanner, sweeps
-from command_line import run, succeed
+from command_line import refuse, run, succeed
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -93,6 +93,21 @@ def test_a_model_of_a_further_axis_alone_is_inverted(capsys, folder, tmp_path):
         assert set(drive) == {'t', 'v_b'}
         made = scanner().own('y_b').simulate(drive['v_b'])
         assert np.abs(made[-1000:] - y_b).max() < 1e-8
+
+
+def test_the_picture_of_an_axis_replaces_no_file(capsys, folder, tmp_path):
+    words = ['predict', folder / 'stage.yaml', folder / 'raster.npz']
+    words += ['--plot', tmp_path / 'p.png']
+    pictures = [tmp_path / name for name in ('p_y.png', 'p_y_b.png')]
+    pictures[1].write_text('mine')
+    refuse(capsys, tmp_path, words, f'{pictures[1]}: exists already', '--overwrite')
+    data = json.loads(succeed(capsys, *words, '--overwrite', '--json'))
+    assert data['plot'] == [str(path) for path in pictures]
+    assert sorted(tmp_path.iterdir()) == pictures
+    said = succeed(capsys, *words, '--overwrite')
+    assert [line for line in said.splitlines() if 'wrote' in line] == [
+        f'wrote {path}' for path in pictures
+    ]
 
 
 def test_the_slew_of_static_axes_is_at_the_rate_of_the_motion(capsys, folder, tmp_path):
