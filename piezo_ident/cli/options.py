@@ -137,7 +137,7 @@ NODE_ARGUMENTS = _argument('arguments', '[ARGUMENTS]...', nargs=-1, type=click.U
 READING = [
     _option(
         *('--columns', str, 't=NAME,...'),
-        'Name or number of the columns t, v, y (default: by the header).',
+        'Name or number of t, v, y, and v_b, y_b of a second axis (default: by the header).',
         multiple=True,
         callback=_columns,
     ),

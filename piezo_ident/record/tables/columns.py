@@ -164,9 +164,20 @@ def _guessed(
             ways = titles if len({*titles}) == len(titles) else [str(i + 1) for i in fitting]
             first, second = (_option(role, way) for way in ways[:2])
             fault = f'{len(titles)} columns may be the {_QUANTITIES[role]} ({listed(titles)})'
-            raise DataError(f'{path}: {fault}; say which: {first} or {second}', options=first)
+            cure = f'say which: {first} or {second}'
+            if role in 'vy' and _may_be_axes(names):
+                cure += '; for two axes name all columns with --columns: v, y, v_b and y_b'
+            raise DataError(f'{path}: {fault}; {cure}', options=first)
         guessed.update((role, i) for i in fitting)
     return guessed
+
+
+def _may_be_axes(names: Sequence[str]) -> bool:
+    """Return whether several columns may be a voltage, and several a displacement."""
+    # v_y is a voltage, though its words name a displacement too
+    roles = [role_of(name_and_unit(name)[0]) for name in names]
+    columns = [(i, name) for i, name in enumerate(names) if not roles[i]]
+    return all(roles.count(role) + len(_fitting(role, columns)) > 1 for role in 'vy')
 
 
 def _is_apart(role: str, place: int, names: Sequence[str]) -> bool:

@@ -199,6 +199,9 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, name):
             ['2 columns may be the voltage', '--columns v=volt_a', 'volt_b'],
         ),
         ('time,U,U,pos', ['2 columns may be the voltage (U, U)', '--columns v=2 or', 'v=3']),
+        ('t,v_x,v_y,y_x,y_y', ['--columns y=y_x or --columns y=y_y; for two axes', 'v_b and y_b']),
+        ('t,drive_1,drive_2,pos_1,pos_2', ['v=drive_2; for two axes name all columns']),
+        ('t,v,y_x,y_y', ['2 columns may be the displacement', '--columns y=y_x or']),
         ('t,v,y,v', ['column v stands there twice', '--columns v=2']),
         ('time,voltage,ai0,ai1', ['y missing', '--columns y=ai0']),
         ('time,ai0,ai1,ai2', ['v, y missing', '--columns v=ai0,y=ai1']),
@@ -214,12 +217,13 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, name):
 )
 def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
     path = tmp_path / 'r.csv'
-    columns = (K / RATE, V, 1e-6 * UM, V)[: header.count(',') + 1]
+    columns = (K / RATE, V, 1e-6 * UM, V, V)[: header.count(',') + 1]
     path.write_text(f'{header}\n{rows(*columns)}')
     with pytest.raises(DataError) as caught:
         pi.read(path)
     message = str(caught.value)
     assert message.isprintable() and all(word in message for word in (str(path), *words)), message
+    assert ('for two axes' in message) == ('for two axes' in ''.join(words))
 
 
 @pytest.mark.parametrize(
