@@ -223,6 +223,9 @@ def _check_ranges(table: OrderedRows, options: ReadOptions, name: str) -> None:
         cure = f'name the unit of y with --displacement-unit {" or ".join(fitting)}'
         if split_unit(unit)[0]:
             way, cure = '', 'is the number before the unit right?'
+        elif STROKE[0] <= span <= STROKE[1] < stroke:
+            swap = 'if v and y are swapped, name their columns, as in --columns v=y,y=v'
+            way, cure = '', f'v spans {span:.3g} V; {swap}, else {cure}'
         raise DataError(
             f'{name}: a stroke of {stroke:.3g} m, read in {unit}, is no piezo stage '
             f'(1 nm .. 10 mm); {cure}',

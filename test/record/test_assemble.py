@@ -294,6 +294,10 @@ def scaled(*by: float) -> list[np.ndarray]:
             '450 of 500 displacements .* in 50 places; .* all rows without a displacement',
         ),
         *((scaled(1, 1, f), '--displacement-unit') for f in (1e6, 1e-6)),
+        (
+            [columns()[k] for k in (0, 2, 1)],
+            'v spans .* V; if v and y are swapped, .* --columns v=y,y=v, else name the unit',
+        ),
         *((scaled(f, 1, 1), 'write t in seconds') for f in (1e15, 1e-9)),
         *((scaled(1, f, 1), 'no voltage') for f in (1e-320, 1e13)),
         *((scaled(1, 1, f), 'no piezo stage') for f in (1e-314, 1e305)),
