@@ -363,7 +363,10 @@ def test_bad_arrays(tmp_path, name, change, words):
 def test_pickled_objects_are_refused(tmp_path):
     path = tmp_path / 'r.npz'
     np.savez(path, **{**table(), 'v': np.array([{}] * 300)})
-    refuse(path, 'save it again')
+    refuse(path, 'v is an array of Python objects', 'np.asarray(v, float)')
+    labels = {'segment_name': np.array(['sine'], object), 'segment_start': [0]}
+    np.savez(path, **table(), **labels)
+    refuse(path, 'np.asarray(segment_name, str)')
 
 
 @pytest.mark.parametrize(

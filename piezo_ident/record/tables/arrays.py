@@ -43,7 +43,7 @@ def read_npz(path: Path, options: ReadOptions) -> RecordTable:
         with np.load(path, allow_pickle=False) as archive:
             names = archive.files
             if {*names}.issuperset(options.needed) and not options.columns:
-                used = {k: archive[k] for k in names if re.fullmatch(_USED, k)}
+                used = {k: _unpickled(archive, k, path) for k in names if re.fullmatch(_USED, k)}
                 return _table(used, names, path, options)
             arrays: dict[str, Any] = {}
             for name in names:
@@ -52,8 +52,19 @@ def read_npz(path: Path, options: ReadOptions) -> RecordTable:
                 except ValueError as error:
                     if 'allow_pickle' not in str(error):
                         raise
-            arrays |= {k: archive[k] for k in _LABELS if k in names}
+            arrays |= {k: _unpickled(archive, k, path) for k in _LABELS if k in names}
     return _table(arrays, arrays, path, options)
+
+
+def _unpickled(archive: Any, name: str, path: Path) -> Any:
+    try:
+        return archive[name]
+    except ValueError as error:
+        if 'allow_pickle' not in str(error):
+            raise
+        kind = 'str' if name == 'segment_name' else 'float'
+        cure = f'save it as np.asarray({name}, {kind})'
+        raise DataError(f'{path}: {name} is an array of Python objects; {cure}') from None
 
 
 def read_mat(path: Path, options: ReadOptions) -> RecordTable:
