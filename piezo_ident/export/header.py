@@ -252,8 +252,8 @@ def checked_name(name: str) -> None:
     """Raise ConfigError for a name that is not allowed in C."""
     if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', name):
         raise ConfigError(
-            f'export: {name!r} is no name for C; give small letters, digits and _, a letter first',
-            options='--name stage',
+            f'export: {name!r} is no name for C; give small letters, digits and _, a letter '
+            'first, as in --name stage'
         )
 
 

@@ -82,6 +82,7 @@ COMMANDS = (
     ('convert R T/r.csv --displacement-topic y', 'is for bags', 'record.npz'),
     ('identify R --each T/out --overwrite', 'does not go with --each'),
     ('identify R --each T/out --namespace other', 'is for bags', 'record.npz'),
+    ('export M --out T/s.h --name 3x', 'a letter first, as in --name stage\n'),
     # models and records that do not go together
     ('predict R M', 'MODEL comes first: piezo_ident predict'),
     ('predict R R', 'MODEL comes first: piezo_ident predict'),
