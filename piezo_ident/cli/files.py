@@ -210,9 +210,8 @@ def check_suffix(path: Path, suffixes: Iterable[str], what: str) -> None:
     known = list(suffixes)
     if path.suffix.lower() not in known:
         names = ', '.join(s or 'a folder' for s in known)
-        raise ConfigError(
-            f'{path}: {what} cannot be written as {path.suffix or "a folder"}; choose {names}'
-        )
+        way = f'as {path.suffix}' if path.suffix else 'without an ending'
+        raise ConfigError(f'{path}: {what} cannot be written {way}; choose {names}')
 
 
 def check_output(

@@ -114,6 +114,7 @@ OUTPUTS = (
     ('predict M R --plot T/file/y.png', 'T/file/y.png'),
     ('predict M R --out R', ';'),
     ('predict M R --out T/y.mat', 'y.mat'),
+    ('predict M R --out T/y', 'written without an ending; choose .csv, .npz'),
     ('simulate T/file/r.csv', 'T/file/r.csv'),
     ('simulate --overwrite /dev/null', 'device'),
     (f'simulate T/{"x" * 300}.csv', 'cannot be written'),
