@@ -83,7 +83,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     {'limits': [0, 10]}
     """
     if len(text) > YAML_SIZE:
-        raise ConfigError(f'{name}: too large, {YAML_SIZE} characters at most; check the name')
+        raise ConfigError(f'{name}: too large for a model or program; check the name')
     if _MERGE_KEY.search(text):
         raise ConfigError(f'{name}: merge keys (<<) are not read; write the values out')
     try:

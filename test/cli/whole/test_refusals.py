@@ -168,6 +168,7 @@ def test_what_cannot_work(capsys, tmp_path, made, monkeypatch, case):
         (': : :\n\t{', 'write it again'),
         ('- 1\n', 'mapping'),
         ('', 'mapping'),
+        ('<p>' * 200_000, 'too large for a model'),
         ('schema_version: 1\n', 'is this a model file'),
     ],
 )
