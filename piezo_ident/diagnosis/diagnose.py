@@ -68,7 +68,8 @@ def diagnose(
     settings = DiagnosisSettings() if settings is None else settings
     records = records_of(records, 'diagnose, second argument')
     expect(model, StageModel, 'diagnose, first argument', 'read a model with load')
-    expect(settings, DiagnosisSettings, 'diagnose, settings', 'give several records as a list')
+    hint = 'make them with DiagnosisSettings(...), and give several records as one list'
+    expect(settings, DiagnosisSettings, 'diagnose, settings', hint)
     if not records:
         raise IdentificationError('no record was given')
     for record in records:

@@ -73,7 +73,8 @@ def identify_and_judge(
     """Identify a stage of one axis; also return the base of promise, band and deviations."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
-    expect(settings, Settings, 'identify, settings', 'give several records as a list')
+    hint = 'make them with Settings(...), and give several records as one list'
+    expect(settings, Settings, 'identify, settings', hint)
     with singular_is_ours():
         return _identify(records, settings, validation, progress, steps)
 

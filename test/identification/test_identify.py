@@ -12,7 +12,7 @@ import re
 from measured_data import measured_record
 import numpy as np
 from numpy.testing import assert_array_equal
-from piezo_ident.common.errors import Cancelled, IdentificationError, PiezoIdentError
+from piezo_ident.common.errors import Cancelled, DataError, IdentificationError, PiezoIdentError
 from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import step1_delay, three_steps
 from piezo_ident.identification.identify import identify
@@ -628,6 +628,11 @@ def test_a_hold_out_of_no_sample_is_one_line(hold_out):
     with pytest.raises(IdentificationError, match='--hold-out') as caught:
         identify(record, Settings(hold_out=hold_out))
     assert '\n' not in str(caught.value)
+
+
+def test_settings_of_another_type_are_refused():
+    with pytest.raises(DataError, match=r'got dict; make them with Settings\(\.\.\.\)'):
+        identify(short(), {'thresholds': 4})
 
 
 def test_a_singular_fit_is_an_error_of_ours(monkeypatch):
