@@ -88,6 +88,9 @@ class ReadOptions:
                     f'{known[-1]}, or what one of the file is, as in 10{known[-2]}'
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)
+        if self.voltage_limits is not None and self.voltage_limits[0] > self.voltage_limits[1]:
+            low, high = self.voltage_limits
+            raise DataError(f'voltage limits {low:g}..{high:g} V: give the lower one first')
         if self.rate is not None:
             cure = 'give the samples a second, as in 20e3'
             expect(self.rate, Real, 'rate', cure)
