@@ -104,9 +104,10 @@ def _unit_of(quantity: str, role: str) -> click.Option:
             raise click.BadParameter(f'{text!r} is no unit; give {", ".join(known)}')
         return scaled
 
+    volt = {'v': ', or one volt of a monitor', 'y': ', or one volt of a sensor'}.get(role, '')
     text = (
         f'Unit of {role} in the files (default: by the header, else {next(iter(known))}). '
-        f'With a number, as in 10{[*known][-2]}: the value of 1 in the file, or of one volt.'
+        f'A number, as in 10{[*known][-2]}, says what a 1 in the file stands for{volt}.'
     )
     return _option(f'--{quantity}-unit', unit, '|'.join(known), text)
 

@@ -4,7 +4,7 @@
 """What helps at the prompt: examples, guesses at misspelt words, completion, errors as JSON."""
 
 from dataclasses import fields
-from itertools import chain
+from itertools import chain, pairwise
 import json
 import shlex
 from types import SimpleNamespace
@@ -64,6 +64,14 @@ def test_what_a_file_lacks_is_added_to_the_command(capsys, tmp_path):
         message = refuse(capsys, tmp_path, words, option)
         words = shlex.split(message.partition('for example: piezo_ident ')[2])
     assert run(capsys, *words)[0] == 0
+
+
+def test_the_help_of_a_unit_tells_of_volts_where_a_column_may_hold_them(capsys):
+    text = ' '.join(succeed(capsys, 'identify', '--help').split())
+    units = ['--time-unit', '--voltage-unit', '--displacement-unit', '--voltage-limits']
+    of_unit = [text[text.index(a) : text.index(b)] for a, b in pairwise(units)]
+    assert ['one volt of a' in x for x in of_unit] == [False, True, True]
+    assert 'volt' not in of_unit[0]
 
 
 def test_columns_may_be_given_in_parts():
