@@ -62,7 +62,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     keep(diagnosis, args, prompt)
     console.say(diagnosis_text(diagnosis))
     note = _changes(diagnosis) or f'the same as {args.model_file}, nothing changed'
-    files = print_files(args, console, f' ({note})')
+    files = print_files(diagnosis, args, console, f' ({note})')
     steps = print_next(diagnosis, prompt, console)
     console.result(
         {

@@ -67,7 +67,7 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
         checks.append({**report.to_json(run), 'sines': list(map(asdict, sines))})
         if sines:
             console.say(f'\n{report.table_one(sines)}')
-    files = print_files(args, console)
+    files = print_files(result, args, console)
     steps = print_next(result, prompt, console)
     console.result({**report.to_json(result), 'validation': checks, 'files': files, 'next': steps})
 
@@ -90,15 +90,16 @@ def checked(
             check_file(args.model, overwrite=args.overwrite)
     if args.report is not None:
         other = 'diagnosis' if kind is Identification else 'identification'
-        if (args.report / f'{other}.json').exists():
-            raise ConfigError(f'{args.report}: holds the report of {other}; choose another folder')
-        for name in ('model.yaml', 'diagnosis.json', 'report.html'):
-            check_distinct(args.report / name, inputs)
-        check_report_folder(args.report, kind)
-        if (args.report / 'report.html').exists() and not args.overwrite:
-            raise DataError(
-                f'{args.report}: holds a report already; choose another folder or add --overwrite'
-            )
+        for folder in (*args.report.glob('y'), *args.report.glob('y_*'), args.report):
+            if (folder / f'{other}.json').exists():
+                raise ConfigError(f'{folder}: holds the report of {other}; choose another folder')
+            for name in ('model.yaml', 'diagnosis.json', 'report.html'):
+                check_distinct(folder / name, inputs)
+            check_report_folder(folder, kind)
+            if (folder / 'report.html').exists() and not args.overwrite:
+                raise DataError(
+                    f'{folder}: holds a report already; choose another folder or add --overwrite'
+                )
     return paths, further
 
 
@@ -157,14 +158,18 @@ def keep(result: Results, args: SimpleNamespace, prompt: Prompt) -> None:
             result.model.save(args.model)
 
 
-def print_files(args: SimpleNamespace, console: Console, note: str = '') -> dict[str, Any]:
-    """Print the places of model and report; return them for JSON."""
-    page = None if args.report is None else str(args.report / 'report.html')
+def print_files(
+    result: Results, args: SimpleNamespace, console: Console, note: str = ''
+) -> dict[str, Any]:
+    """Print the places of model and reports; return them for JSON, several reports as a list."""
+    axes = list(result) if isinstance(result, EachAxis) else ['']
+    pages = [str(args.report / axis / 'report.html') for axis in axes if args.report is not None]
     console.say()
     if args.model is not None:
         console.say(f'model: {args.model}{note}')
-    if page is not None:
+    for page in pages:
         console.say(f'report: {page}')
-    if args.model is None and page is None:
+    if args.model is None and not pages:
         console.say('nothing was written; --model YAML keeps the model, --report DIR the report')
-    return {'model': None if args.model is None else str(args.model), 'report': page}
+    report = pages if pages[1:] else next(iter(pages), None)
+    return {'model': None if args.model is None else str(args.model), 'report': report}

@@ -179,7 +179,9 @@ def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     target = Path(folder)
     if (target / NUMBERS[kind]).exists():
         return
-    for name in (PAGE, MODEL, *(f'{name}.png' for name in PICTURES[kind])):
+    # beside the reports of axes lies the model of their stage
+    names = [PAGE] if any(target.glob(f'y*/{NUMBERS[kind]}')) else [PAGE, MODEL]
+    for name in (*names, *(f'{name}.png' for name in PICTURES[kind])):
         if (target / name).exists():
             raise DataError(
                 f'{target / name}: exists and is of no earlier report; choose another folder'

@@ -11,7 +11,9 @@ from axes_scanner import play, raster, scanner, sweeps
 from command_line import refuse, run, succeed
 import numpy as np
 import piezo_ident as pi
+from piezo_ident.identification.results import Identification
 from piezo_ident.operators.dynamics import Delay, Dynamics
+from piezo_ident.report import check_report_folder
 import pytest
 
 
@@ -40,7 +42,21 @@ def test_identify_and_diagnose_write_the_model_of_all_axes(capsys, folder, tmp_p
     assert 'motion_b' in said and str(refined) in said
     assert list(pi.load(refined).axes) == ['y', 'y_b']
     for axis in ('y', 'y_b'):
-        assert (tmp_path / 'report' / axis / 'report.html').is_file()
+        page = tmp_path / 'report' / axis / 'report.html'
+        assert page.is_file() and f'report: {page}' in said
+
+
+def test_the_report_of_an_axis_is_kept_until_it_may_be_replaced(capsys, folder, tmp_path):
+    page, words = tmp_path / 'y_b' / 'report.html', ['identify', folder / 'learn.npz']
+    words += ['--report', tmp_path]
+    page.parent.mkdir()
+    page.write_text('mine')
+    refuse(capsys, tmp_path, words, f'{page}: exists and is of no earlier report')
+    for path in (page.with_name('identification.json'), tmp_path / 'model.yaml'):
+        path.write_text('')
+    refuse(capsys, tmp_path, words, f'{page.parent}: holds a report already', '--overwrite')
+    check_report_folder(tmp_path, Identification)
+    refuse(capsys, tmp_path, ['diagnose', folder / 'stage.yaml', *words[1:]], 'of identification')
 
 
 def test_invert_reads_a_motion_of_each_axis(capsys, folder, tmp_path):
