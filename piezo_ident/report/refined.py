@@ -41,8 +41,9 @@ def validated(
 
 def _judged(result: Diagnosis, parts: Iterable[tuple[Record, FreeRun | None]]) -> Diagnosis:
     """Add the errors on records; a run of shared modes replaces the run of the refined model."""
-    result = replace(result, unseen=(*result.unseen, *(_unseen(result, *x) for x in parts)))
-    return replace(result, sentence=sentence(result))
+    unseen = tuple(_unseen(result, *x) for x in parts)
+    judged = replace(result, unseen=(*result.unseen, *unseen))
+    return replace(judged, sentence=sentence(judged)) if unseen else result
 
 
 def _unseen(result: Diagnosis, record: Record, refined: FreeRun | None) -> Unseen:
