@@ -53,6 +53,15 @@ def _slipped(s: float, way: float, gamma: float, skew: float, power: float) -> f
     return half
 
 
+@part_of_kernels
+def _stepped(step: Array, q: float, p: float, begin: float, end: float) -> tuple[float, float]:
+    # the linear mode after a sub-step, whose input moves along a line
+    return (
+        step[0, 0] * q + step[0, 1] * p + step[0, 2] * begin + step[0, 3] * end,
+        step[1, 0] * q + step[1, 1] * p + step[1, 2] * begin + step[1, 3] * end,
+    )
+
+
 @ordered_kernel
 def run_loop(
     x: Array, step: Array, spring: Array, elements: Array, state: Array, memory: Array, out: Array
@@ -79,8 +88,7 @@ def run_loop(
         for j in range(count):
             tau = (j + 1.0) / count - 1.0
             end = w0 + tau * (slope + tau * bend)
-            m0 = step[0, 0] * l0 + step[0, 1] * l1 + step[0, 2] * begin + step[0, 3] * end
-            m1 = step[1, 0] * l0 + step[1, 1] * l1 + step[1, 2] * begin + step[1, 3] * end
+            m0, m1 = _stepped(step, l0, l1, begin, end)
             e0 = step[0, 0] * d0 + step[0, 1] * d1 - step[0, 2] * h
             e1 = step[1, 0] * d0 + step[1, 1] * d1 - step[1, 2] * h
             force = h
@@ -90,7 +98,7 @@ def run_loop(
                 force = q * (a + q * (square + q * cubic)) + c * p
                 for i in range(elements.shape[0]):
                     r = elements[i, 1]
-                    play = min(max(memory[i, 0], q - r), q + r)
+                    play = held(memory[i, 0], q - r, q + r)
                     slip = _slipped(
                         memory[i, 1],
                         play - memory[i, 0],
@@ -134,8 +142,7 @@ def run_loops(
         for j in range(count):
             tau = (j + 1.0) / count - 1.0
             end = w0 + tau * (slope + tau * bend)
-            m0 = step[0, 0] * l0 + step[0, 1] * l1 + step[0, 2] * begin + step[0, 3] * end
-            m1 = step[1, 0] * l0 + step[1, 1] * l1 + step[1, 2] * begin + step[1, 3] * end
+            m0, m1 = _stepped(step, l0, l1, begin, end)
             # a number of lanes that the compiler knew would be unrolled instead of vectorised, and
             # so would rows of an unknown length
             for i in range(lanes):
