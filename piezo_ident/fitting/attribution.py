@@ -171,9 +171,9 @@ class Attribution:
         if self._fast is None:
             # the output of the high-pass begins at zero
             self._fast = np.stack([-keep * rows[:, :1], np.zeros((len(rows), 1))], axis=-1)
-        fast = np.empty_like(rows)
+        fast, section = np.empty_like(rows), np.array([[keep, -keep, 0.0, -keep, 0.0]])
         for row, state, out in zip(rows, self._fast, fast, strict=True):
-            run_sections(row, np.array([[keep, -keep, 0.0, -keep, 0.0]]), state, out)
+            run_sections(row, section, state, out)
         fast, x = fast[:, counts], rows[0, counts]
         left = np.exp(-rows.shape[1] / (FADE * self._rate))
         self._products = left * self._products + fast @ fast.T
