@@ -243,15 +243,14 @@ SIMULATE = [
 ]
 
 #: fields of `Settings`
+_solver = click.Choice(['least_squares', 'swarm', 'joint'])
 IDENTIFY = [
-    _option(
-        '--thresholds', _thresholds, 'N|auto', 'Number of plays (default: by held-out error).'
-    ),
+    _option('--thresholds', _thresholds, 'N|auto', 'Plays of H (default: by held-out error).'),
     _option('--order', _order, 'NA,NB', 'Order of G (default: searched).'),
     _option('--max-order', _whole, 'N', 'Largest order of the search (default: 15).'),
     _option('--delay', _whole, 'SAMPLES', 'Delay (default: identified).'),
     _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is held out.'),
-    _option('--solver', click.Choice(['least_squares', 'swarm']), None, 'Solver of the weights.'),
+    _option('--solver', _solver, None, 'Of the weights of H; joint: all in one fit, no steps.'),
     _flag('--polish', 'Let least squares finish the fit of the swarm.'),
     _option('--seed', _whole, 'N', 'Seed of the swarm (default: 0).'),
 ]

@@ -90,11 +90,16 @@ def _identify(
     validation = [without_faults(record) for record in validation]
     runs, scaling = data.runs, data.scaling
     refuse_delay(data.pieces, settings.delay)
-    if not data.labelled and steps is not None:
-        raise IdentificationError(_UNLABELLED.format('hysteresis', 'noise and triangle'))
+    in_steps = data.labelled and settings.solver != 'joint'
+    if not in_steps and steps is not None:
+        raise IdentificationError(
+            'hysteresis: the solver joint has no single steps; identify in one go'
+            if data.labelled
+            else _UNLABELLED.format('hysteresis', 'noise and triangle')
+        )
 
     def fitted(runs: Sequence[Run]) -> FitOutcome:
-        if data.labelled:
+        if in_steps:
             return fit_three_steps(runs, data.rate, scaling, settings, progress, steps or Steps())
         return fit_free_run(runs, data.rate, scaling, settings, progress)
 

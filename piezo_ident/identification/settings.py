@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Any, Literal
+from typing import Any, get_args, Literal
 
 from piezo_ident.common.errors import ConfigError, expect_numbers
 
-Solver = Literal['least_squares', 'swarm']
+Solver = Literal['least_squares', 'swarm', 'joint']
 #: callback with the name of the step and its share done; it raises `Cancelled` to stop
 Progress = Callable[[str, float], None]
 
@@ -31,9 +31,11 @@ class Settings:
     thresholds : int, optional
         Number of plays of H, including the play at r = 0, evenly spaced over the excited range.
         The paper takes ten.  By default, number and places are chosen by held-out error.
-    solver : {'least_squares', 'swarm'}
+    solver : {'least_squares', 'swarm', 'joint'}
         Solver of the weights.  Least squares finds the optimum of this convex problem.  The swarm
         is the solver of the paper, and the model keeps its weights unless `polish` is set.
+        'joint' skips the three steps: delay, G and H are fitted together to all motion, as
+        for a record without labels.
     polish : bool
         Let bounded least squares finish the fit of the swarm.
     max_order : int
@@ -78,7 +80,7 @@ class Settings:
         sizes: Any = self.order or (1, 1)
         rules = {
             'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
-            'solver': (self.solver in ('least_squares', 'swarm'), 'least_squares or swarm'),
+            'solver': (self.solver in get_args(Solver), ' or '.join(get_args(Solver))),
             'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
             'max_order': (1 <= self.max_order <= 50, '1 to 50'),
             'order': (

@@ -171,8 +171,8 @@ def warn_of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]
         warnings.append(
             f'on rests and ramps the model errs by up to {max(easy):.3g} % of stroke, more than '
             f'the {chosen:.3g} % on the data that chose it. The model lacks an effect of the '
-            'stage: diagnose it, or identify a copy of the record without labels, which fits all '
-            'motion together'
+            'stage: diagnose it, or identify it with the solver joint, which fits all motion '
+            'together'
         )
     fitted = result.error('fitted')
     # a record without noise may be fitted exactly, so a tiny error serves as the smallest

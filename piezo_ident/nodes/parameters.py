@@ -155,8 +155,8 @@ IDENTIFIER = (
     Declaration(
         'solver',
         'least_squares',
-        'solver of the weights of H',
-        choices=('least_squares', 'swarm'),
+        'solver of the weights of H; joint: one fit instead of the three steps',
+        choices=('least_squares', 'swarm', 'joint'),
     ),
     Declaration('polish', False, 'whether least squares refine the result of the swarm'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),

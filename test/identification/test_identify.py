@@ -17,6 +17,7 @@ from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.identification import step1_delay, three_steps
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.refusals import refuse_undriven
+from piezo_ident.identification.results import Steps
 from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import delay_from_steps
 from piezo_ident.identification.warnings import warnings_of
@@ -343,6 +344,19 @@ def test_measured_open_loop_is_identified_with_a_warning():
     assert result.warnings
     assert result.model.dynamics.is_stable
     assert result.error('fitted') < 2.0
+
+
+def test_the_solver_joint_fits_labelled_motion_together():
+    record = decimated(short(), 40)
+    joint = Settings(thresholds=4, order=(1, 1), solver='joint')
+    result = identify(record, joint)
+    assert result.model.identification['method'] == 'joint free-run fit'
+    bare = identify(relabelled(record), replace(joint, solver='least_squares'))
+    v = record.pieces[0].v
+    assert_array_equal(result.model.simulate(v), bare.model.simulate(v))
+    assert any(row.segment.startswith('triangle') for row in result.errors)
+    with pytest.raises(IdentificationError, match='joint has no single steps'):
+        identify(record, joint, steps=Steps())
 
 
 # -- awkward records ---------------------------------------------------------------------------
