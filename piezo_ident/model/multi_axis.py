@@ -25,13 +25,13 @@ from typing import Any, Generic, TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, real_array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.model.axis_records import axis_record, columns_of, MOTION, motion_of, voltage_of
 from piezo_ident.model.free_run import free_run, predict
 from piezo_ident.model.modes.shared_modes import SharedModes
-from piezo_ident.model.stage_model import EffectSetting, StageModel
+from piezo_ident.model.stage_model import EffectSetting, StageModel, warn_of_unused
 from piezo_ident.record.record import Piece, Record
 
 if TYPE_CHECKING:
@@ -255,9 +255,12 @@ class MultiAxisModel:
             When the voltage of an axis is missing.
         """
         self.check_axes(voltages, 'simulate')
-        v, further = {a: voltages[voltage_of(a)] for a in self.axes}, dict(channels or {})
-        if len({np.size(x) for x in v.values()}) > 1:
+        columns = {a: voltage_of(a) for a in self.axes}
+        v = {a: real_array(voltages[k], f'simulate, {k}') for a, k in columns.items()}
+        further = dict(channels or {})
+        if len({x.size for x in v.values()}) > 1:
             raise DataError('simulate: the voltages of the axes differ in length')
+        warn_of_unused(self.axes.values(), further)
         if self.modes is not None:
             return self.modes.of_axes(v)
         chains = {a: self.own(a) for a in self.axes}

@@ -10,7 +10,7 @@ StageModel: the chain of operators with its scaling, and its predictions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -260,9 +260,8 @@ class StageModel(FrontDoor):
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
         if not all(np.isfinite(z).all() for z in piece.channels.values()):
             raise DataError('simulate: each channel must be a vector of finite numbers')
-        unused = sorted(piece.channels.keys() - self.used(piece.channels).keys())
-        doubts = [f'simulate: no effect of the model uses the channel {k}' for k in unused]
-        for warning in (*doubts, *self.extrapolation(Record((piece,), 'simulate'))):
+        warn_of_unused([self], piece.channels)
+        for warning in self.extrapolation(Record((piece,), 'simulate')):
             warnings.warn(warning, stacklevel=2)
         return self.stream(start).follow(piece)
 
@@ -339,3 +338,10 @@ class StageModel(FrontDoor):
         if 0.0 < max(abs(least), abs(most)) < FAINT * max(abs(low), abs(high)):
             return (f'{reach}, far less than {identified}; is it in volts?',)
         return ()
+
+
+def warn_of_unused(models: Iterable[StageModel], channels: Iterable[str]) -> None:
+    """Warn the caller of a verb about channels that no effect of the models depends on."""
+    used = {effect.channel for model in models for effect in model.effects}
+    for name in sorted(set(channels) - used):
+        warnings.warn(f'no effect of the model uses the channel {name}', stacklevel=3)

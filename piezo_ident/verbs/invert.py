@@ -20,7 +20,7 @@ from piezo_ident.control.inverse import invert as invert_axis
 from piezo_ident.model.axis_records import motion_of, voltage_of
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
-from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stage_model import StageModel, warn_of_unused
 
 #: most rounds of an inversion of several axes, and largest change of a voltage in the last round,
 #: as a share of the span of the model
@@ -138,6 +138,7 @@ def invert(
     if not isinstance(model, MultiAxisModel):
         if isinstance(wanted, Mapping):
             raise DataError('invert: the model has one axis; give one motion')
+        warn_of_unused([model], channels or {})
         return invert_axis(model, wanted, channels=channels, **options)
     goals = _goals(model, wanted)
     if model.modes is not None:

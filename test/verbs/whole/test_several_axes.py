@@ -119,6 +119,15 @@ def test_an_axis_that_is_not_named_stays_at_rest():
     assert np.ptp(drive.predicted['y']) < 0.01e-6
 
 
+@pytest.mark.parametrize('model', [scanner(), scanner().own('y')])
+def test_a_channel_that_no_effect_uses_is_told_once(model):
+    y = np.full(500, 10e-6)
+    wanted = {'y': y} if isinstance(model, MultiAxisModel) else y
+    with pytest.warns(UserWarning, match='no effect of the model uses the channel heat') as told:
+        pi.invert(model, wanted, channels={'heat': y})
+    assert len(told) == 1
+
+
 @pytest.mark.parametrize(
     ('wanted', 'names'),
     [
@@ -177,6 +186,7 @@ def all_of(model, *axes):
             'y_b and y_B',
         ),
         (lambda: scanner().simulate({'v': np.zeros(20), 'v_b': np.zeros(10)}), 'length'),
+        (lambda: scanner().simulate({'v': [0.0], 'v_b': ['low']}), 'v_b: expected real numbers'),
     ],
 )
 def test_axes_that_do_not_belong_together_are_refused(work, names):
