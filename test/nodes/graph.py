@@ -118,9 +118,11 @@ class Graph(Observer):
             self._thread.join(60.0)
             # what is frozen keeps entities of nodes that are destroyed
             gc.unfreeze()
-            self._executor.shutdown(timeout_sec=1.0)
-            self.node.destroy_node()
-            rclpy.shutdown(context=self.context)
+            # now and then the middleware does not come back from its wait: leave the node to it
+            if not self._thread.is_alive():
+                self._executor.shutdown(timeout_sec=1.0)
+                self.node.destroy_node()
+                rclpy.shutdown(context=self.context)
             shutil.rmtree(self.folder, ignore_errors=True)
             self._lock.close()
         if kind is None:
