@@ -13,7 +13,7 @@ one set of equations, so the dependence between them is in each replicate.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
@@ -46,6 +46,23 @@ class Linearised:
     def of(cls, fit: Fit) -> Linearised:
         """Take the equations of a fit of all parameters together."""
         return cls(fit.stage, fit.equations.A, fit.equations.b, fit.prior_weight())
+
+    def in_steps(self, of_G: Mask) -> Linearised:
+        """
+        Fit G and offsets to the blocks `of_G` with H held, then H and offsets to the others.
+
+        An error of G moves H, and no error of H moves G.  A thus is not symmetric any more.
+        """
+        stage = self.stage
+        G = np.zeros(stage.values.size, dtype=bool)
+        G[stage.place_of_dynamics] = True
+        other = ~G
+        other[stage.place_of_offsets] = False
+        A, b = self.A.copy(), self.b.copy()
+        for block, unused in ((of_G, other), (~of_G, G)):
+            A[np.ix_(block, unused)], b[np.ix_(block, unused)] = 0.0, 0.0
+        A[of_G] *= ~other
+        return replace(self, A=A, b=b)
 
     def replicates(self) -> Iterator[Stage]:
         """Yield the stage at `SHARE` of the way to the solution without each block in turn."""

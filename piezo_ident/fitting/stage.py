@@ -197,6 +197,16 @@ class Stage:
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
     @property
+    def place_of_dynamics(self) -> slice:
+        """Place of a and b among the values."""
+        return self._parts()[2]
+
+    @property
+    def place_of_offsets(self) -> slice:
+        """Place of the offsets among the values."""
+        return self._parts()[3]
+
+    @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the values, shapes (p,)."""
         h, creep, *_, lags, starts = self._parts()

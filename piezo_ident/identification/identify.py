@@ -92,11 +92,9 @@ def _identify(
     refuse_delay(data.pieces, settings.delay)
     in_steps = data.labelled and settings.solver != 'joint'
     if not in_steps and steps is not None:
-        raise IdentificationError(
-            'hysteresis: the solver joint has no single steps; identify in one go'
-            if data.labelled
-            else _UNLABELLED.format('hysteresis', 'noise and triangle')
-        )
+        own = 'hysteresis: the solver joint has no single steps; identify in one go'
+        other = _UNLABELLED.format('hysteresis', 'noise and triangle')
+        raise IdentificationError(own if data.labelled else other)
 
     def fitted(runs: Sequence[Run]) -> FitOutcome:
         if in_steps:

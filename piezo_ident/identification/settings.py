@@ -34,8 +34,7 @@ class Settings:
     solver : {'least_squares', 'swarm', 'joint'}
         Solver of the weights.  Least squares finds the optimum of this convex problem.  The swarm
         is the solver of the paper, and the model keeps its weights unless `polish` is set.
-        'joint' skips the three steps: delay, G and H are fitted together to all motion, as
-        for a record without labels.
+        'joint' fits delay, G and H in one step, as to a record without labels.
     polish : bool
         Let bounded least squares finish the fit of the swarm.
     max_order : int

@@ -95,6 +95,8 @@ class DynamicsResult:
         measured displacement, and of H.  All are normalised.
     band : float
         Highest frequency with power in the input [Hz].
+    others : tuple of Dynamics
+        G of other orders whose error counts as equal.
     """
 
     order: tuple[int, int]
@@ -106,6 +108,7 @@ class DynamicsResult:
     slope_measured: float = float('nan')
     slope_model: float = float('nan')
     band: float = float('nan')
+    others: tuple[Dynamics, ...] = ()
 
     @property
     def known_to(self) -> float:
@@ -309,17 +312,19 @@ def _best_in_free_run(
     rate = runs[0].piece.sample_rate
     best, (result, G) = float('inf'), candidates[0]
     G = fast_part(G, rate, lean)
+    refined = []
     for i, (candidate, start) in enumerate(candidates):
         tick = functools.partial(progress, 'dynamics', 0.65 + 0.2 * i / len(candidates))
-        fast = fast_part(start, rate, lean)
-        fit = output_error(stretches, fast, maxiter=6, tick=tick)
+        fit = output_error(stretches, fast_part(start, rate, lean), maxiter=6, tick=tick)
         score = simulation_error(held, fit.dynamics)
+        refined.append((score, fast_part(fit.dynamics, rate, lean)))
         # a larger model comes later, and must lower the error to win
         if score < best / (1.0 + GAIN):
             best, result = score, candidate
-            G = fast_part(fit.dynamics, rate, lean)
+            G = refined[-1][1]
         progress('dynamics', 0.65 + 0.2 * (i + 1) / len(candidates))
-    return result, G
+    others = tuple(x for score, x in refined if x is not G and score <= (1.0 + SLACK) * best)
+    return replace(result, others=others), G
 
 
 def beside_law(

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from piezo_ident.common.arrays import Mask
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import IdentificationError, ModelError
 from piezo_ident.fitting.free_run import fit
 from piezo_ident.fitting.jackknife import Linearised
 from piezo_ident.fitting.stage import PARTS, Stage
@@ -21,10 +21,10 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.selection.judged import Judged, JudgedRun
 
 #: number of blocks of each step, and most rows of its equations (time)
-BLOCKS, MOST_ROWS = 30, 100_000
-#: most samples times parameters: 1e8 take about a second of processor time
+BLOCKS, MOST_ROWS = 30, 50_000
+#: most samples times parameters: 1e8 take about two seconds of processor time
 MOST_WORK = 3e8
-#: kinds of segments to which the steps of labelled records fit H and G
+#: kinds of segments to which the steps of labelled records fit H, and G
 STEPS = 'triangle', 'noise'
 
 
@@ -32,8 +32,8 @@ def linearised(result: Identification, judged: Judged) -> Linearised | None:
     """
     Linearise the free run of an identified model at its parameters.
 
-    Returns None for weights of the swarm, for fitted starts of labelled records, and for records
-    that would take too long.
+    Returns None for weights of the swarm, for fitted starts of labelled records, for records that
+    would take too long, and if the equations have no solution.
     """
     if result.hysteresis.solver == 'swarm':
         return None
@@ -41,13 +41,16 @@ def linearised(result: Identification, judged: Judged) -> Linearised | None:
         return Linearised.of(judged.fit)
     model, runs = result.model, judged.runs
     try:
-        stage = stage_of(model, result.hysteresis.law, len(runs))
-    except ModelError:
+        # each step has offsets of its own
+        stage = stage_of(model, result.hysteresis.law, len(STEPS) * len(runs))
+        # these equations hold the start constant
+        if result.memories or stage.values.size * sum(r.use.size for r in runs) > MOST_WORK:
+            return None
+        stretches = [s for step in range(len(STEPS)) for s in _stretches(model, runs, step)]
+        whole = Linearised.of(fit(stage, stretches, iterations=0))
+    except (IdentificationError, ModelError):
         return None
-    # these equations hold the start constant
-    if result.memories or stage.values.size * sum(r.use.size for r in runs) > MOST_WORK:
-        return None
-    return Linearised.of(fit(stage, _stretches(model, runs), iterations=0))
+    return whole.in_steps(np.arange(len(whole.A)) >= BLOCKS)
 
 
 def stage_of(model: StageModel, name: str, records: int = 1) -> Stage:
@@ -58,18 +61,18 @@ def stage_of(model: StageModel, name: str, records: int = 1) -> Stage:
     return replace(stage, coefficients=model.dynamics.gain * law.coefficients(model.hysteresis))
 
 
-def _stretches(model: StageModel, runs: Sequence[JudgedRun]) -> list[Stretch]:
-    """Take the samples that the steps fitted, each step in `BLOCKS` blocks of one size."""
-    size = {kind: max(1, sum(int(_fitted(run, kind).sum()) for run in runs)) for kind in STEPS}
-    every, before, parts = -(-sum(size.values()) // MOST_ROWS), 0.0, list[Stretch]()
-    for i, run in enumerate(runs):
-        own = {kind: _fitted(run, kind) for kind in STEPS}
-        count = before + sum((np.cumsum(x) / size[kind] for kind, x in own.items()), np.zeros(1))
-        before, n = float(count[-1]), run.use.size
-        use = np.any(list(own.values()), axis=0) & (np.arange(n) // 20 % every == 0)
+def _stretches(model: StageModel, runs: Sequence[JudgedRun], step: int) -> list[Stretch]:
+    """Take the samples to which a step was fitted, in `BLOCKS` blocks of one size."""
+    own = [_fitted(run, STEPS[step]) for run in runs]
+    total, before = max(1, sum(int(use.sum()) for use in own)), 0
+    every, parts = -(-total // MOST_ROWS), list[Stretch]()
+    for i, (run, use) in enumerate(zip(runs, own, strict=True), step * len(runs)):
+        count = before + np.cumsum(use)
+        before = int(count[-1])
         u, x = model.scaling.u(run.piece.v), model.scaling.x(run.piece.y)
-        block = np.minimum(count * BLOCKS, len(STEPS) * BLOCKS - 1).astype(int)
-        parts.append(Stretch(u, x, use, block, run.piece.sample_rate, i, i))
+        block = step * BLOCKS + np.minimum(count * BLOCKS // total, BLOCKS - 1)
+        thinned = use & (np.arange(use.size) // 20 % every == 0)
+        parts.append(Stretch(u, x, thinned, block, run.piece.sample_rate, i, i))
     return parts
 
 

@@ -6,7 +6,9 @@ State the quantities that a user reads from a model, with their standard deviati
 
 A deviation is how far another record of the same motion and noise would move a quantity, by the
 replicates of `piezo_ident.fitting.jackknife`.  A 95 % interval is the value plus and minus about
-two deviations: Student's quantile for one degree of freedom fewer than blocks.
+two deviations: Student's quantile for one degree of freedom fewer than blocks.  Orders of G whose
+error counts as equal add their rms difference: Buckland, Burnham and Augustin, "Model selection:
+an integral part of inference", Biometrics 53(2), 1997, doi:10.2307/2533961.
 
 Limits: the delay is a whole number of samples and does not vary in these equations.  Deviations
 contain the error of the law of H as far as it differs from block to block.  An error that all
@@ -22,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.jackknife import deviations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.identification.results import Identification
@@ -46,11 +47,7 @@ SAME_MODE = 0.2
 
 def with_deviations(result: Identification, judged: Judged) -> Identification:
     """Add quantities and deviations to the model of an identification."""
-    try:
-        fitted = linearised(result, judged)
-    except IdentificationError:
-        # the deviations of the steps stay
-        fitted = None
+    fitted = linearised(result, judged)
     if fitted is None:
         return result
     model, frequencies = result.model, _frequencies(result)
@@ -63,7 +60,11 @@ def with_deviations(result: Identification, judged: Judged) -> Identification:
         replicas.append(np.concatenate([moved, _coefficients(stage)]))
     whole = np.concatenate([at, _coefficients(fitted.stage)])
     std = deviations(np.array(replicas).reshape(-1, whole.size), whole)
-    # a mode that replicates lack is unknown
+    orders = [replace(fitted.stage, dynamics=G) for G in result.dynamics.others]
+    others = [[row.value for row in _quantities(x, model, frequencies, near)] for x in orders]
+    off = np.array([at, *others], dtype=np.float64) - at
+    std[: at.size] = np.hypot(std[: at.size], np.sqrt(np.mean(off**2, axis=0)))
+    # a mode that replicates or other orders lack is unknown
     told = np.where(np.isfinite(std), std, np.inf)
     quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=False)]
     known = {**model.identification, QUANTITIES: quantities}
@@ -112,20 +113,23 @@ def _quantities(
         size = share * (high - low)
         width = abs(s.Y) * _loop_width(stage, 0.5 * (low + high - size), size)
         yield ModelParameter('H', f'loop width at {share:.0%} of the range', width, 'm')
-    if not G.is_static:
+    if not near.is_static:
         response = G.response(frequencies, rate)
-        phase = np.unwrap(np.angle(response))
+        # a sample of delay may as well be a sample of G, so the phase contains the delay
+        phase = np.unwrap(np.angle(response)) - 2.0 * np.pi * frequencies * stage.delay / rate
         for f, gain, angle in zip(frequencies, np.abs(response), phase, strict=True):
             yield ModelParameter('G', f'gain at {f:.4g} Hz', float(gain), '')
             yield ModelParameter('G', f'phase at {f:.4g} Hz', math.degrees(angle), 'deg')
         modes = G.modes(rate)
         for i, mode in enumerate(near.modes(rate), 1):
+            # nothing drove faster modes
+            if mode.frequency > frequencies[-1]:
+                break
             far = [abs(x.frequency / mode.frequency - 1.0) for x in modes]
             same = modes[int(np.argmin(far))] if far and min(far) < SAME_MODE else None
-            yield ModelParameter('G', f'mode {i}', same.frequency if same else math.nan, 'Hz')
-            yield ModelParameter(
-                'G', f'damping of mode {i}', same.damping if same else math.nan, ''
-            )
+            f, damping = (same.frequency, same.damping) if same else (math.nan, math.nan)
+            yield ModelParameter('G', f'mode {i}', f, 'Hz')
+            yield ModelParameter('G', f'damping of mode {i}', damping, '')
     for tau, share in zip(stage.taus, stage.creep, strict=True):
         yield ModelParameter('creep', f'gain at {tau:.4g} s', float(share), '')
 
