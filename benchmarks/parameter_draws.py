@@ -40,6 +40,10 @@ NOISE = 1e-4
 #: grids, noises and records; and the number of the draw without noise, which is the reference
 GRIDS, NOISES, RECORDS = ('on', 'off'), ('white', '1/f'), ('labelled', 'unlabelled')
 REFERENCE = -1
+#: a mode is that of the reference if their frequencies differ by less than this share
+SAME_MODE = 0.2
+#: name, value and deviation of quantities
+Rows = tuple[tuple[str, float, float], ...]
 #: a 95 % interval in deviations
 TWO = 2.0
 
@@ -72,7 +76,7 @@ class Draw:
     """Quantities with their value and deviation; NaN if none is stated."""
 
     key: str
-    rows: tuple[tuple[str, float, float], ...] = ()
+    rows: Rows = ()
     error: str = ''
 
 
@@ -141,20 +145,43 @@ class Quantity:
     bias: float
 
 
+def _as_named(rows: Rows, truth: Mapping[str, float]) -> Rows:
+    """Name each mode as the nearest mode of the reference; drop what is said to be unknown."""
+    known = {name: f for name, f in truth.items() if name.startswith('G mode')}
+    names = {}
+    for name, f, _ in rows:
+        if name.startswith('G mode'):
+            same = min(known, key=lambda k: abs(known[k] / f - 1.0), default='')
+            if same and abs(known[same] / f - 1.0) < SAME_MODE:
+                names[name], names[name.replace('G ', 'G damping of ')] = (
+                    same,
+                    same.replace('G ', 'G damping of '),
+                )
+    return tuple(
+        (names[name] if 'mode' in name else name, value, std)
+        for name, value, std in rows
+        if np.isfinite(std) and ('mode' not in name or name in names)
+    )
+
+
 def table(draws: Mapping[str, Draw], todo: Sequence[DrawTodo]) -> list[Quantity]:
     """Judge each quantity of each variant that has two draws or more, and deviations."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    truths = {}
+    for grid, record in itertools.product(GRIDS, RECORDS):
+        reference = draws.get(f'{grid} none {record} {REFERENCE}', Draw(''))
+        truths[grid, record] = {name: value for name, value, _ in reference.rows}
     for one in todo:
         if one.number != REFERENCE and one.key in draws:
-            for name, value, std in draws[one.key].rows:
+            truth = truths[one.grid, one.record]
+            for name, value, std in _as_named(draws[one.key].rows, truth):
                 found.setdefault((one.variant, name), []).append((value, std))
     rows = []
     for (variant, name), values in found.items():
         grid, _, record = variant.split()
-        reference = draws.get(f'{grid} none {record} {REFERENCE}', Draw(''))
-        truth = {own: value for own, value, _ in reference.rows}
+        truth = truths[grid, record]
         value, std = np.array(values).T
-        if name not in truth or value.size < 2 or not np.isfinite(std).all():
+        if name not in truth or value.size < 2:
             continue
         off, scatter = value - truth[name], max(float(value.std(ddof=1)), 1e-300)
         held, beside = (float(np.mean(np.abs(x) <= TWO * std)) for x in (off, off - off.mean()))
