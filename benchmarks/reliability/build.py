@@ -40,8 +40,8 @@ HEAD = """# Reliability
 This page lists, for whoever connects an amplifier, the attempts to break the drive, the graph and
 the files, and their results.
 
-*Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`. Each row can be
-run again with its command, from the root of the sources, after `make test`, with `.venv` active.*
+*Made by `python benchmarks/reliability/build.py` from `docs/reliability/rows/`. The commands run
+from the root of the sources, after `make test`, with `.venv` active.*
 
 """
 
@@ -51,10 +51,8 @@ TAIL = """
 Whatever arrives on `voltage`, every voltage that is *applied* is a number within the limits and no
 further from the voltage before than the slew allows. Where limits are moved, the voltage goes back
 into them at the slew. Silence ends at rest by a ramp, a new stream is joined by a ramp, a second
-publisher moves nothing. `benchmarks/reliability/safety.py` has the property as code.
-
-The property holds while the process that drives the amplifier lives. Only a watchdog in the
-amplifier helps against SIGKILL and power failure ([My driver](driver.md)).
+publisher moves nothing. `benchmarks/reliability/safety.py` has the property as code. It holds
+while the process that drives the amplifier lives ([My driver](driver.md)).
 
 ## Damaged files and kills
 
@@ -63,13 +61,13 @@ plug-in that cannot be imported is skipped with a warning. [Security](SECURITY.m
 threats that remain.
 
 An output is written as `.NAME.RANDOM.tmp` (`.new.RANDOM.tmp` in a report folder) and renamed when
-it is whole. A process that is killed leaves such a file, which can be deleted, and the old output.
-The files of a report are put in place one by one, the page last. An unfinished sqlite3 bag is read
-from a copy in the folder for temporary files, `piezo_ident_bag_RANDOM`.
+it is whole. A killed process leaves such a file, which can be deleted, and the old output. An
+unfinished sqlite3 bag is read from a copy in the folder for temporary files,
+`piezo_ident_bag_RANDOM`.
 
 ## Two hosts
 
-DDS finds its peers on other hosts by multicast. Both hosts need
+Both hosts need
 
     export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
     export ROS_DOMAIN_ID=...                      # the same on both, and of no other graph
@@ -83,9 +81,8 @@ samples, every listener says how many, and no model is made where too much is mi
 ## How long is long
 
 Memory that grows with messages shows in two hours (1.4e8 samples) as in a week. The sample clock
-t = k/fs stays exact to 2^53 ticks, 14,000 years. A full disk, a stage that drifts, leaks of
-Fast DDS below the resolution of the slope and a clock of the machine that is set are not tried
-here.
+t = k/fs stays exact to 2^53 ticks, 14,000 years. Not tried: a stage that drifts, leaks of Fast DDS
+below the resolution of the slope, a clock of the machine that is set.
 """
 
 
