@@ -234,7 +234,7 @@ Fastest peer over the same orders: {fastest}, {ratio(same[fastest].over(turns[ba
 time. sippy_unipi runs `system_identification` with `"ARX"`, `IC="BIC"` and our delay. SysIdentPy
 runs linear `FROLS` with `LeastSquares`: at every order, for which it is not made, or over
 {2 * most} nested models of the same lags. We lack the nonlinear terms of SysIdentPy, and
-the search for the delay and the ARMAX, Box-Jenkins and subspace models of sippy_unipi."""
+the search for the delay and the further models of sippy_unipi."""
 
 
 if __name__ == '__main__':

@@ -214,9 +214,9 @@ when the loss is within 1 % of what `scipy.optimize.lsq_linear` finds.
 
 {table}
 
-pyswarms has a static ring with k = 7, the best of some thirty settings, and offers topologies,
-handlers and histories that ours does not. differential_evolution has `popsize=5,
-recombination=0.95`, the best of ten, and is the better choice where an evaluation is expensive.
+pyswarms has a static ring with k = 7, the best of some thirty settings. differential_evolution has
+`popsize=5, recombination=0.95`, the best of ten, and is the better choice where an evaluation is
+expensive.
 Bounded least squares finds the optimum itself in {seconds(task.optimum_time)}."""
     return [('Swarm to the same loss', text)]
 

@@ -112,8 +112,7 @@ ten errors of a normal law do.
 
 By default a gain, loop or mode that changed stays an error: the node then advises to identify
 again, to follow the gain, or to adapt. No way follows a load. Amid strong creep of earlier
-motion the adaptation takes creep for gain, and errs more in its first seconds than the observer
-alone.
+motion the adaptation first takes creep for gain, and errs more than the observer alone.
 """
 
 

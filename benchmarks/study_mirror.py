@@ -69,8 +69,8 @@ part of this project. Orthogonal multisines up to 3 kHz drive all three voltages
 steady state.
 
 **Held out**: realisations {held_out} (from zero) at each amplitude; no fit and no decision uses
-them. The form of the laws was found with their errors in view; the test part of the benchmark,
-which is not used here, is the one clean judge.
+them. The form of the laws was found with their errors in view; the unused test part of the
+benchmark is the one clean judge.
 
 ## The verdict
 
@@ -90,8 +90,7 @@ outputs and realisations held out. The published rows are pooled over all output
 
 ![Spectra of the motion and of the errors](images/mirror_residual.png)
 
-*Outputs held out, errors of two models, and noise between periods: rms in bands of 25 Hz, in % of
-rms(y).*
+*Rms in bands of 25 Hz, in % of rms(y).*
 
 ## The law that was added
 
@@ -108,7 +107,7 @@ The linear part has {order} states. Nine signals z act back on the mechanics as 
   voltages.
 
 The fit by the error in free run ends at mixtures of motion and voltage, {parameters} numbers in
-all. The data show the effect and not its cause: a joint that slips would look alike.
+all. A joint that slips would look alike.
 
 The model is stable at each level between {low:.2f} and {high:.2f}, the plays at rest; beyond them
 the softening stays.
@@ -117,15 +116,13 @@ the softening stays.
 
 ![Frequency and damping of modes against the voltage](images/mirror_modes.png)
 
-*Modes that stand alone, from a modal model refined at each amplitude: dots for the measured
-records, lines for the named model.*
+*Modes that stand alone. Dots: the measured records; lines: the named model.*
 
 | mode / Hz | frequency at 100 / 200 / 300 mV | of the model | damping in % | of the model |
 |---|---|---|---|---|
 {modes}
 
-Frequencies fall nearly in proportion to the amplitude, as by Rayleigh's law of small loops; the
-damping of some modes rises.
+Frequencies fall nearly in proportion to the amplitude; the damping of some modes rises.
 
 ## Records that do not repeat
 

@@ -56,8 +56,8 @@ HEADS = ('scaled voltage', 'identified', 'refined', f'after {REPETITIONS} repeti
 TEXT = """\
 # How near a stage comes to a wanted motion
 
-This page gives the tracking errors of a stage without a controller, under the inverse of a model.
-`make track` made it. Each simulated stage follows laws that the model does not have. Its sensor
+This page gives the tracking errors of a stage without a controller, under the inverse of a model
+(`make track`). Each simulated stage follows laws that the model does not have. Its sensor
 has the steps of its converter, up to 0.04 % here. The stage was identified from one record and
 diagnosed on another, with an undeclared effect. Then it had to follow {motions} motions.
 
