@@ -63,11 +63,13 @@ def errors_of_segments(runs: Iterable[JudgedRun]) -> dict[str, Array]:
     return {label: np.concatenate(parts) for label, parts in found.items()}
 
 
-def unseen_runs(model: StageModel, parts: Iterable[tuple[str, Piece, Mask]]) -> list[JudgedRun]:
-    """Run a model as on unseen records, at the zero of each record."""
+def unseen_runs(
+    model: StageModel, parts: Iterable[tuple[str, Piece, Mask, float]]
+) -> list[JudgedRun]:
+    """Run a model as on unseen records, at the known or clearly moved zero of each."""
     runs = []
-    for record, piece, use in parts:
-        y = model.predict_piece(piece, fit_start(model, piece, use))
+    for record, piece, use, zero in parts:
+        y = model.predict_piece(piece, fit_start(model, piece, use)) + zero
         runs.append(JudgedRun(record, piece, y, use, np.zeros(y.size, dtype=bool)))
     moved = {}
     for name in {run.record for run in runs}:

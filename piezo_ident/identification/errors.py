@@ -35,13 +35,14 @@ class Prediction:
     Free run of a model, and of its hysteresis alone, over a run [m].
 
     `judged` leaves out the samples that estimate an unknown memory at the start, because they
-    cannot test the model.
+    cannot test the model.  `zero` is the zero of displacement of the run.
     """
 
     run: Run
     y_hat: Array
     y_static: Array
     judged: Mask
+    zero: float = 0.0
 
 
 def key_of(run: Run) -> tuple[str, float]:
@@ -84,7 +85,7 @@ def predictions_of(
         # a sensor may have been zeroed between two records
         zero = (offsets or {}).get(key_of(run), 0.0)
         y_hat, y_static = (m.predict_piece(run.piece, start) + zero for m in (model, static))
-        predictions.append(Prediction(run, y_hat, y_static, judged))
+        predictions.append(Prediction(run, y_hat, y_static, judged, zero))
     return predictions
 
 

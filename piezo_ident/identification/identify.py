@@ -137,7 +137,7 @@ def _identify(
     fast = fast_error(judged, fit.hysteresis.law, runs)
     provenance = _provenance(result, records, fast)
     judged_runs = (
-        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted)
+        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted, p.zero)
         for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
     )
     result = replace(result, model=replace(model, identification=provenance))

@@ -32,6 +32,8 @@ class JudgedRun:
         Samples that count.
     held : ndarray of bool, shape (n,)
         Samples that no fit of the judged model used.
+    zero : float, optional
+        Known zero of displacement of the record, from that of the model [m].
     """
 
     record: str
@@ -39,6 +41,7 @@ class JudgedRun:
     predicted: Array
     use: Mask
     held: Mask
+    zero: float = 0.0
 
     @property
     def error(self) -> Array:

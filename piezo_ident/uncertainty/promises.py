@@ -46,7 +46,7 @@ def with_band(model: StageModel, band: PredictionBand) -> StageModel:
 def promised_identification(result: Identification, judged: Judged) -> Identification:
     """Add promise and band to an identification."""
     model = result.model
-    alone = unseen_runs(model, ((r.record, r.piece, r.use) for r in judged.runs))
+    alone = unseen_runs(model, ((r.record, r.piece, r.use, r.zero) for r in judged.runs))
     own, more = (
         {label: float(np.sum(e**2)) / max(e.size, 1) for label, e in errors_of_segments(x).items()}
         for x in (judged.runs, alone)
@@ -67,7 +67,7 @@ def promised_diagnosis(result: Diagnosis) -> Diagnosis:
     model = result.model
     result = replace(result, weights=weights_of(result.errors_of_sets))
     fit, stroke = result.runs, result.stroke
-    runs = unseen_runs(model, ((r.record, r.piece, r.sound) for r in result.residuals))
+    runs = unseen_runs(model, ((r.record, r.piece, r.sound, 0.0) for r in result.residuals))
     same, other = (
         blocks_of(model, runs, excess(fit, {k: (0.01 * x * stroke) ** 2 for k, x in e.items()}))
         for e in (result.held_out.by_segment if result.held_out else {}, result.after.by_segment)

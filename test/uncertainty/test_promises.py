@@ -112,6 +112,16 @@ def test_what_a_fitted_start_explains_is_not_promised():
     assert 0.8 < promise.same / result.model.score(record).percent < 1.25
 
 
+def test_a_known_zero_of_a_record_is_not_promised():
+    one, other = swept(lambda t: 1.0 + t), swept(lambda t: 2.0 + t)
+    settings = Settings(thresholds=6, order=(2, 2), delay=0)
+    together = identify([other, one], settings).promise.same
+    (p,) = other.pieces
+    # a zero that does not show clearly beside the other errors
+    moved = Record((replace(p, y=p.y + 0.02 * together * one.stroke),), 'moved')
+    assert 0.8 < identify([moved, one], settings).promise.same / together < 1.25
+
+
 def test_one_frequency_promises_nothing_of_other_motion():
     settings = Settings(thresholds=6, order=(2, 2), delay=0)
     assert identify(swept(lambda t: 5.0), settings).promise.other is None
