@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import itertools
+import math
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
@@ -29,6 +30,9 @@ DAMPING, WORSE, BETTER, LEAST, MOST = 1e-4, 5.0, 0.1, 1e-9, 1e6
 SLOW = 1e-4
 #: independent observations in a block, as neighbouring residuals are alike (taste)
 OBSERVATIONS = 5.0
+#: most passes over the weight of the prior, and the share of the loss at which they end; smallest
+#: share of the loss that a step may promise, and smallest loss: what is below is rounding
+PASSES, ALIKE, EXACT, TINY = 10, 0.9, 1e-12, 1e-290
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +131,7 @@ def fit(
         better, gained, damping = _step(here, equations, stretches, damping)
         if better is None:
             break
-        fall, here = gained / here.loss, better
+        fall, here = gained, better
         damping = max(damping * BETTER, LEAST)
         equations, done = _linearised(here, stretches), done + 1
         if fall < SLOW or here.loss == 0.0:
@@ -153,36 +157,65 @@ def _step(
     here: _Point, equations: Equations, stretches: Sequence[Stretch], damping: float
 ) -> tuple[_Point | None, float, float]:
     """Find the first better point with its gain and its damping; None if no step helps."""
-    values, (lower, upper) = here.stage.values, here.stage.bounds
-    middle, weight = here.stage.prior[0], _prior_weight(here.stage, here.loss, equations.rows)
-    A = equations.A.sum(axis=0) + weight
-    b = equations.b.sum(axis=0) + weight @ (middle - values)
-    cost, rising = _prior_cost(values - middle, weight), here.stage.rising
-    bounds = lower - values, upper - values
+    stage, count = here.stage, _observations(equations.rows)
+    values = stage.values
+    now = _cost(here.loss, count, stage, values)
     while damping < MOST:
-        step = bounded_step(A, b, *bounds, damping=damping, rising=rising)
-        if float(step @ (2.0 * b - A @ step)) < SLOW * here.loss:
+        step, left = _solved(here, equations, damping)
+        if now - _cost(left, count, stage, values + step) < SLOW * count:
             break
         try:
-            there = _at(here.stage.moved(values + step), stretches)
+            there = _at(stage.moved(values + step), stretches)
         except ModelError:
             damping *= WORSE
             continue
-        gained = here.loss - there.loss + cost - _prior_cost(there.stage.values - middle, weight)
+        gained = now - _cost(there.loss, count, stage, there.stage.values)
         if gained > 0.0:
-            return there, gained, damping
+            return there, gained / count, damping
         damping *= WORSE
     return None, 0.0, damping
 
 
-def _prior_cost(away: Array, weight: Array) -> float:
-    """Compute the contribution of a prior to the loss."""
-    return float(away @ weight @ away)
+def _solved(here: _Point, equations: Equations, damping: float) -> tuple[Array, float]:
+    """
+    Solve the linearised equations; return the step and the loss that it promises.
+
+    The prior counts like one observation with the rms residual that is left, so the equations are
+    solved again with the residual that they promise.
+    """
+    stage, left = here.stage, here.loss
+    values, (lower, upper) = stage.values, stage.bounds
+    A, b, step = equations.A.sum(axis=0), equations.b.sum(axis=0), np.zeros(values.size)
+    for _ in range(PASSES):
+        weight = _prior_weight(stage, left, equations.rows)
+        step = bounded_step(
+            A + weight,
+            b + weight @ (stage.prior[0] - values),
+            lower - values,
+            upper - values,
+            damping=damping,
+            rising=stage.rising,
+        )
+        before = left
+        left = max(here.loss - float(step @ (2.0 * b - A @ step)), EXACT * here.loss)
+        if left > ALIKE * before:
+            break
+    return step, left
+
+
+def _cost(loss: float, count: float, stage: Stage, values: Array) -> float:
+    """Compute minus twice the logarithm of the posterior density, with the noise left open."""
+    middle, information = stage.prior
+    away = values - middle
+    return count * math.log(max(loss, TINY)) + float(away @ information @ away)
+
+
+def _observations(rows: Integers) -> float:
+    return max(1.0, OBSERVATIONS * float(np.count_nonzero(rows)))
 
 
 def _prior_weight(stage: Stage, loss: float, rows: Integers) -> Array:
-    observations = max(1.0, OBSERVATIONS * float(np.count_nonzero(rows)))
-    return stage.prior[1] * (loss / observations)
+    return stage.prior[1] * (loss / _observations(rows))
 
 
 def _loss(

@@ -41,8 +41,8 @@ BLOCKS = 50
 #: number of plays of H, including the play at r = 0, unless the user sets it
 PLAYS = 40
 #: voltages for which H is fitted, normalised.  The densities of H end with this span.  It is wider
-#: than 0 .. 1, because similar motion may leave the range slightly (taste: a seventh)
-SPAN = (-0.15, 1.15)
+#: than 0 .. 1, because similar motion may leave the range slightly (taste: a twentieth)
+SPAN = (-0.05, 1.05)
 #: the first 1/`RINGING` of a window is not fitted, as earlier motion may still ring there (taste)
 RINGING = 20
 #: number of elements of creep that are tried, spread over the times of a record (one a decade)
@@ -95,8 +95,7 @@ def fit_free_run(
     progress('dynamics', 1.0)
     kept = _thinned(stretches)
     start = best.fit.stage
-    if search.stretches is not stretches:
-        start = start.on_other(stretches)
+    start = start if search.stretches is stretches else start.on_other(stretches)
     judged = fit(start, kept)
     progress('hysteresis', 0.6)
     everything = _thinned([s.with_use(run.use) for s, run in zip(stretches, chosen, strict=True)])
@@ -134,9 +133,9 @@ def _stretches(runs: Sequence[Run], parts: Sequence[Mask]) -> tuple[list[Stretch
 def _search(
     stretches: Sequence[Stretch], guesses: Array, settings: Settings, progress: Progress
 ) -> Search:
+    swing = max(float(np.ptp(s.u[s.use])) for s in stretches if s.use.any())
     if sum(s.u.size for s in stretches) > MOST:
         stretches = _windows(stretches)
-    swing = max(float(np.ptp(s.u[s.use])) for s in stretches if s.use.any())
     law = HysteresisLaw('plays', even_thresholds(swing, settings.thresholds or PLAYS), SPAN)
     count = 1 + max(int(s.block[-1]) for s in stretches)
     steps = 0
@@ -153,7 +152,7 @@ def _search(
 
 
 def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Choose three windows: of the widest motion, of the fastest, and of wide and fast motion."""
+    """Choose three windows: of the widest motion, of the fastest, and of the largest jump."""
     size = WINDOWED // 3
     windows = []
     for s in stretches:
@@ -163,7 +162,8 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
                 windows.append((s, part))
     spans = [float(np.ptp(s.u[part])) for s, part in windows]
     speeds = [float(np.mean(np.diff(s.u[part]) ** 2)) for s, part in windows]
-    order = [int(np.argmax(spans)), int(np.argmax(speeds))]
+    jumps = [float(np.max(np.abs(np.diff(s.u[part])))) for s, part in windows]
+    order = [int(np.argmax(x)) for x in (spans, speeds, jumps)]
     order += sorted(range(len(windows)), key=lambda i: -spans[i] * speeds[i])
     chosen = list(dict.fromkeys(order))[:3]
     short_stretches, count = [], 0
@@ -187,10 +187,7 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Thin stretches to at most `MOST_ROWS` samples that count, in whole pieces of each block."""
     n = sum(int(s.use.sum()) for s in stretches)
-    if n <= MOST_ROWS:
-        return list(stretches)
-    piece = 200
-    every = -(-n // MOST_ROWS)
+    piece, every = 200, max(1, -(-n // MOST_ROWS))
     return [s.with_use(s.use & (np.arange(s.u.size) // piece % every == 0)) for s in stretches]
 
 

@@ -72,9 +72,11 @@ def outcome_of(
     delay = _delay_result(fits, settings, rate, band)
     missing = _missing(fits, delay, rate, band)
     names = ', '.join(_named(run, mask) for run, mask in zip(chosen, parts, strict=True))
+    reason = 'no segments labelled noise and triangle'
     warnings = [
-        'no segments labelled noise and triangle: delay, dynamics and hysteresis were fitted '
-        f'together to {names}, as the errors say; the model was then fitted to all of it',
+        f'{"solver joint" if settings.solver == "joint" else reason}: delay, dynamics and '
+        f'hysteresis were fitted together to {names}, as the errors say; the model was then '
+        'fitted to all of it',
         *warn_of_range(chosen, parts, scaling),
         *warn_of_zeros(offsets, scaling),
         *_warn_of_creep(fits),

@@ -112,6 +112,15 @@ def test_paper_stage_is_found(paper):
     assert result.error('selection') == pytest.approx(result.noise_floor, rel=0.1)
 
 
+def test_paper_stage_is_found_by_one_fit(paper):
+    # its H hardly rises behind the end of the range, its densities are lines, and no window of the
+    # search sees all of its range
+    record, _ = paper
+    model = identify(record, Settings(10, 'joint', order=(10, 10), delay=3)).model
+    assert max(sine_errors(PAPER.model, model)) <= 0.02
+    assert loop_error(PAPER.model, model) <= 0.02
+
+
 def test_steps_that_slow_noise_has_shifted_are_not_followed(monkeypatch):
     def late(pieces):
         return replace(delay_from_steps(pieces), samples=7)
@@ -355,6 +364,7 @@ def test_the_solver_joint_fits_labelled_motion_together():
     v = record.pieces[0].v
     assert_array_equal(result.model.simulate(v), bare.model.simulate(v))
     assert any(row.segment.startswith('triangle') for row in result.errors)
+    assert 'solver joint' in result.warnings[0] and 'no segments' in bare.warnings[0]
     with pytest.raises(IdentificationError, match='joint has no single steps'):
         identify(record, joint, steps=Steps())
 
