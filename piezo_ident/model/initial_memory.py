@@ -19,20 +19,27 @@ same problem.  A model with creep adds the remaining creep of each element,
 therefore fitted, too, unless creep within the range explains the record as well without it.
 
 `piezo_ident.model.observer` follows the same state of a running stage, but it sees no later sample
-and lumps unknown plays into an offset.  Behind the early part it errs as this fit where the memory
-is known, and 2 to 6 times more where it is not; within the early part 2 to 100 times more.  A
-smoother of its states (Rauch, Tung and Striebel) sees the later samples, too.  Within the early
-part it errs 0.6 to 1.3 times as this fit where the memory is known, and 1 to 5 times where it is
-not: an offset moves the whole early part, a play only until it is caught.  With the sizes, zeros
-and correlated error of the observer as its priors this fit errs 0.02 to 3.4 times as much (10th
-and 90th percentile of 36 simulated records): better if the zero has moved, worse if the stage
-creeps otherwise than the model.  Records are therefore fitted, with weak priors.
+and lumps unknown plays into an offset.  A smoother of its states (Rauch, Tung and Striebel) sees
+the later samples, too.  Their errors over the error of this fit:
+
+| estimate | samples | memory known | memory unknown |
+|---|---|---|---|
+| observer | behind the early part | 1 | 2 to 6 |
+| observer | within the early part | 2 to 100 | 2 to 100 |
+| smoother | within the early part | 0.6 to 1.3 | 1 to 5 |
+
+An offset moves the whole early part, but a play moves it only until the voltage catches the play.
+With the sizes, zeros and correlated error of the observer as its priors, this fit errs 0.02 to 3.4
+times as much (10th and 90th percentile of 36 simulated records): less if the zero has moved, more
+if the stage creeps otherwise than the model.  The priors of this fit are therefore weak.
 """
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
-from numpy.typing import NDArray
+from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.effects.creep import Creep
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
@@ -80,9 +87,7 @@ SURE = 1.1
 APART = 0.3
 
 
-def forgotten(
-    u: NDArray[np.float64], share: float = SHARE, way: float = 0.0, enough: float = np.inf
-) -> int:
+def forgotten(u: Array, share: float = SHARE, way: float = 0.0, enough: float = np.inf) -> int:
     """
     Find the first sample at which the voltage has swept a share of its range, or enough.
 
@@ -119,7 +124,7 @@ def forgotten(
 
 
 def forgetting(model: StageModel) -> float:
-    """Return the path over which the lags of a model forget their start [V]; 0 without lags."""
+    """Compute the path over which the lags of a model forget their start [V]; 0 without lags."""
     x = model.hysteresis.relaxations
     if x is None or not x.size:
         return 0.0
@@ -127,12 +132,12 @@ def forgetting(model: StageModel) -> float:
 
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
-    """Return whether a piece starts near the lowest voltage, having come down to it."""
+    """Tell whether a piece starts near the lowest voltage, having come down to it."""
     return abs(float(model.scaling.u(piece.v[0]))) < 0.01 and not rises_first(piece)
 
 
 def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
-    """Return a warning if the voltage alone does not determine the memory at the start."""
+    """Warn if the voltage alone does not determine the memory at the start."""
     v = [pieces[0].v[0] for pieces in connected_pieces(record) if not is_at_rest(model, pieces[0])]
     if not v:
         return ()
@@ -146,11 +151,9 @@ def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:
     )
 
 
-def begins_at_rest(
-    model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
-) -> bool:
+def begins_at_rest(model: StageModel, piece: Piece, sound: Mask | None = None) -> bool:
     """
-    Return whether a piece starts near the lowest voltage, and fits a start at rest there.
+    Tell whether a piece starts near the lowest voltage, and fits a start at rest there.
 
     A stage whose plays had not come down errs at first, until the start is forgotten.
     """
@@ -171,7 +174,7 @@ def begins_at_rest(
 
 
 def early_part(model: StageModel, piece: Piece, *, memory: bool) -> int:
-    """Return the number of samples that serve to estimate the creep, or the `memory`."""
+    """Count the samples that serve to estimate the creep, or the `memory`."""
     creeps, end = _creeps(model), 10
     if memory:
         # later samples no longer depend on the start; with creep, sweep for wide plays, too, which
@@ -183,9 +186,7 @@ def early_part(model: StageModel, piece: Piece, *, memory: bool) -> int:
     return min(end, piece.n)
 
 
-def fit_start(
-    model: StageModel, piece: Piece, sound: NDArray[np.bool_] | None = None
-) -> Start | None:
+def fit_start(model: StageModel, piece: Piece, sound: Mask | None = None) -> Start | None:
     """
     Estimate the state of a stage at the start of a piece.
 
@@ -223,14 +224,14 @@ def fit_start(
 
 
 def crept(model: StageModel, start: Start) -> float:
-    """Return the displacement by creep of earlier motion at a start [m]."""
+    """Compute the displacement by creep of earlier motion at a start [m]."""
     if not start.creep.size:
         return 0.0
     return float(model.scaling.Y * model.dynamics.gain * (creep_elements(model)[0] @ start.creep))
 
 
-def creep_elements(model: StageModel) -> NDArray[np.float64]:
-    """Return gains and time constants [s] of the creep of a model, shape (2, c)."""
+def creep_elements(model: StageModel) -> Array:
+    """List gains and time constants [s] of the creep of a model, shape (2, c)."""
     found = [e.parameters for e in model.effects if e.name == Creep.name]
     return np.array([found[0]['gain'], found[0]['time_constant']]) if found else np.empty((2, 0))
 
@@ -239,111 +240,161 @@ def _creeps(model: StageModel) -> bool:
     return bool(creep_elements(model)[0].any())
 
 
-def _branches(h: Hysteresis, u: float) -> NDArray[np.float64]:
-    """Return H at u after a rise from the lowest voltage, and after a fall from the highest."""
+def _branches(h: Hysteresis, u: float) -> Array:
+    """Compute H at u after a rise from the lowest voltage, and after a fall from the highest."""
     low, high = h.span
     return np.array([h(np.array([*way, u]))[-1] for way in ([low], [low, high])])
+
+
+class _EarlyPart:
+    """
+    Early part of a piece as a problem of least squares.
+
+    A state holds m play outputs, k lags along the path, c distances of creep from its rest, and z
+    zeros of the sensor (0 or 1).
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        piece: Piece,
+        sound: Mask | None,
+        memory: bool,
+        creep: bool,
+        z: int,
+    ) -> None:
+        h = model.hysteresis
+        self.model, self.memory, self.z = model, memory, z
+        self.part = piece.cut(0, early_part(model, piece, memory=memory))
+        n = self.part.n
+        # the plays follow the voltage behind the effects of the input slot
+        self.u = model.hysteresis_input(self.part)
+        u0 = self.u0 = float(self.u[0])
+        # rows are thinned: a few numbers do not need a hundred thousand samples
+        keep = np.arange(n) if sound is None else np.flatnonzero(sound[:n])
+        keep = keep if keep.size else np.arange(n)
+        self.keep = keep[:: max(1, keep.size // 5000)]
+        self.x = model.scaling.x(self.part.y)[self.keep]
+        m, k = (h.thresholds.size, h.lag_range.shape[1]) if memory else (0, 0)
+        self.gains, self.times = creep_elements(model) if creep else np.empty((2, 0))
+        self.m, self.k, self.c = m, k, self.gains.size
+        rest = h.initial_memory(u0)[:m], h.settled(u0)[:k], np.zeros(self.c + z)
+        self.rest, self.falls = np.concatenate(rest), np.diff(h.thresholds, prepend=0.0)[:m]
+
+    def start(self, state: Array) -> Start:
+        """Make the start of a run from a state."""
+        both = self.m + self.k
+        return Start(state[:both] if self.memory else None, state[both : both + self.c])
+
+    def error(self, state: Array) -> Array:
+        """Compute measured minus predicted displacement from a state, normalised."""
+        y_hat = self.model.scaling.x(self.model.predict_piece(self.part, self.start(state)))
+        return np.asarray(self.x - y_hat[self.keep] - (state[-1] if self.z else 0.0))
+
+    def _passed(self, signal: Array) -> Array:
+        g, delayed = self.model.dynamics, self.model.total_delay.apply(signal)
+        return filter_arx(g.a, g.b, delayed)[self.keep]
+
+    @cached_property
+    def columns(self) -> list[Array]:
+        """Derivatives by lags, creep and zero, which are the same at every state."""
+        h, gain = self.model.hysteresis, self.model.dynamics.gain
+        path = np.cumsum(np.abs(np.diff(self.u, prepend=self.u0)))
+        rates = h.relaxations[:, 0] if self.k and h.relaxations is not None else np.empty(0)
+        age = np.arange(self.part.n)[self.keep] / self.part.sample_rate
+        by_lags = [self._passed(np.exp(-a * path)) for a in rates]
+        # creep changes slowly, so it passes G with the static gain
+        pairs = zip(self.gains, self.times, strict=True)
+        by_creep = [gain * share * np.exp(-age / tau) for share, tau in pairs]
+        return [*by_lags, *by_creep, *[np.ones(age.size)] * self.z]
+
+    def play_columns(self, state: Array, rise: Array) -> list[Array]:
+        """Compute the derivatives by the plays at a state; `rise` is the slope of H by each."""
+        top, bottom = np.maximum.accumulate(self.u), np.minimum.accumulate(self.u)
+        columns, thresholds = [], self.model.hysteresis.thresholds[: self.m]
+        for r, q, f in zip(thresholds, rise, state[: self.m], strict=True):
+            # the play follows its start only while neither bound has caught it
+            moved = np.clip(f, np.minimum(top - r, bottom), bottom)
+            free = ((np.abs(moved - f) < 1e-12) & (top - r < bottom)).astype(np.float64)
+            columns.append(q * self._passed(free))
+        return columns
+
+    @cached_property
+    def numbers(self) -> tuple[Array, Array, Array]:
+        """
+        Factors from the fitted numbers to a state, and lower and upper bounds of the numbers.
+
+        The output of a play falls, from one threshold to the next, by a share of their difference.
+        The numbers are these shares, and the other entries of the state.
+        """
+        h, m = self.model.hysteresis, self.m
+        whole = np.eye(self.rest.size)
+        whole[:m, :m] = -np.tril(np.ones((m, m))) * self.falls
+        # creep has followed voltages of the range; H stands between its two branches
+        reach = h(np.linspace(*h.span, 65))[:, None] - _branches(h, self.u0)
+        far = np.repeat([[reach.min(), -FAR], [reach.max(), FAR]], [self.c, self.z], axis=1)
+        lags = h.lag_range[:, : self.k]
+        low = np.concatenate([np.zeros(m), np.minimum([*lags[0], *far[0]], self.rest[m:])])
+        high = np.concatenate([np.ones(m), np.maximum([*lags[1], *far[1]], self.rest[m:])])
+        return whole, low, high
 
 
 def _fit(
     model: StageModel,
     piece: Piece,
-    sound: NDArray[np.bool_] | None = None,
+    sound: Mask | None = None,
     *,
     memory: bool,
     creep: bool = False,
     zero: bool = False,
-) -> tuple[Start, NDArray[np.float64]]:
+) -> tuple[Start, Array]:
     """Fit a start to the early part by least squares; return it with the error of some samples."""
-    h = model.hysteresis
-    part = piece.cut(0, early_part(model, piece, memory=memory))
-    # the plays follow the voltage behind the effects of the input slot
-    u = model.hysteresis_input(part)
-    u0 = float(u[0])
-    # rows are thinned: a few numbers do not need a hundred thousand samples
-    keep = np.arange(part.n) if sound is None else np.flatnonzero(sound[: part.n])
-    keep = keep if keep.size else np.arange(part.n)
-    keep = keep[:: max(1, keep.size // 5000)]
-    x = model.scaling.x(part.y)[keep]
-    m, k = (h.thresholds.size, h.lag_range.shape[1]) if memory else (0, 0)
-    gains, times = creep_elements(model) if creep else np.empty((2, 0))
-    c, z = gains.size, int(zero)
-    rest = np.concatenate([h.initial_memory(u0)[:m], h.settled(u0)[:k], np.zeros(c + z)])
-
-    def start(state: NDArray[np.float64]) -> Start:
-        return Start(state[: m + k] if memory else None, state[m + k : m + k + c])
-
-    def error(state: NDArray[np.float64]) -> NDArray[np.float64]:
-        y_hat = model.scaling.x(model.predict_piece(part, start(state)))
-        return np.asarray(x - y_hat[keep] - (state[-1] if zero else 0.0))
-
+    early = _EarlyPart(model, piece, sound, memory, creep, int(zero))
+    h, m, u0, rest = model.hysteresis, early.m, early.u0, early.rest
     forgets = h.weights.any() or h.rise(np.full(h.thresholds.size, u0)).any() or h.lag_range.any()
     if not ((memory and forgets) or creep):
-        return start(rest), error(rest)
-    top, bottom = np.maximum.accumulate(u), np.minimum.accumulate(u)
-
-    def passed(signal: NDArray[np.float64]) -> NDArray[np.float64]:
-        delayed = model.total_delay.apply(signal)
-        return filter_arx(model.dynamics.a, model.dynamics.b, delayed)[keep]
-
-    path = np.cumsum(np.abs(np.diff(u, prepend=u0)))
-    rates = h.relaxations[:, 0] if k and h.relaxations is not None else np.empty(0)
-    age = np.arange(part.n)[keep] / part.sample_rate
-    others = [passed(np.exp(-a * path)) for a in rates]
-    # creep changes slowly, so it passes G with the static gain
-    pairs = zip(gains, times, strict=True)
-    others += [model.dynamics.gain * gain * np.exp(-age / tau) for gain, tau in pairs]
-    others += [np.ones(age.size)] * z
-    # the output of a play falls, from one threshold to the next, by a share of their difference
-    falls = np.diff(h.thresholds, prepend=0.0)[:m]
-    whole = np.eye(rest.size)
-    whole[:m, :m] = -np.tril(np.ones((m, m))) * falls
-    # creep has followed voltages of the range; H stands between its two branches
-    reach = h(np.linspace(*h.span, 65))[:, None] - _branches(h, u0)
-    far = np.repeat([[reach.min(), -FAR], [reach.max(), FAR]], [c, z], axis=1)
-    lags = h.lag_range[:, :k]
-    low = np.concatenate([np.zeros(m), np.minimum([*lags[0], *far[0]], rest[m:])])
-    high = np.concatenate([np.ones(m), np.maximum([*lags[1], *far[1]], rest[m:])])
-    margin = 1e-9 * np.maximum(high - low, 1.0)
-    weak = np.repeat(np.sqrt([LAG_PULL, CREEP_PULL, 0.0]), [k, c, z])
-    origin = np.append(np.full(m, u0), np.zeros(k + c + z))
-    found: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
+        return early.start(rest), early.error(rest)
     # A play that moves at once gives no derivative by its start.  The search therefore begins
     # twice: with plays after a rise of the voltage, and with plays after a fall.
     down = np.minimum(u0, max(u0, h.span[1]) - h.thresholds)
+    found = []
     for plays in (rest[:m], down) if m else (rest[:m],):
-        falls_of = np.diff(-plays, prepend=-u0) / falls
-        number = np.clip(np.concatenate([falls_of, rest[m:]]), low, high)
-        state = origin + whole @ number
-        e = error(state)
-        for _ in range(TRIALS):
-            columns = []
-            rise = h.rise(state[:m], u0) if m else np.empty(0)
-            for r, q, f in zip(h.thresholds[:m], rise, state[:m], strict=True):
-                # the play follows its start only while neither bound has caught it
-                moved = np.clip(f, np.minimum(top - r, bottom), bottom)
-                free = ((np.abs(moved - f) < 1e-12) & (top - r < bottom)).astype(np.float64)
-                columns.append(q * passed(free))
-            pull = np.sqrt(PULL) * np.maximum(rise, 1e-3)
-            pull = np.sqrt(e.size) * np.append(pull, weak)
-            A = np.vstack([np.array([*columns, *others]).T, np.diag(pull)]) @ whole
-            target = np.concatenate([e, pull * (rest - state)])
-            # the triangular factor holds the same problem in a few rows
-            R = np.asarray(np.linalg.qr(np.column_stack([A, target]), mode='r'))
-            bounds = low - number - margin, high - number + margin
-            step = lsq_linear(R[:, :-1], R[:, -1], bounds).x
-            # a play may begin to move sooner or later than before; the full step then goes too far
-            for share in (1.0, 0.5, 0.25, 0.125):
-                trial = np.clip(number + share * step, low, high)
-                new = error(origin + whole @ trial)
-                if new @ new <= e @ e:
-                    break
-            else:
-                break
-            moved_by = np.abs(trial - number).max()
-            number, e, state = trial, new, origin + whole @ trial
-            if moved_by < 1e-6:
-                break
-        found.append((float(e @ e), state, e))
+        shares = np.diff(-plays, prepend=-u0) / early.falls
+        found.append(_searched(early, np.concatenate([shares, rest[m:]])))
     _, state, e = min(found, key=lambda one: one[0])
-    return start(state), e
+    return early.start(state), e
+
+
+def _searched(early: _EarlyPart, number: Array) -> tuple[float, Array, Array]:
+    """Improve the fitted numbers by linear steps; return the squared error, state and error."""
+    (whole, low, high), m, rest = early.numbers, early.m, early.rest
+    margin = 1e-9 * np.maximum(high - low, 1.0)
+    weak = np.repeat(np.sqrt([LAG_PULL, CREEP_PULL, 0.0]), [early.k, early.c, early.z])
+    origin = np.append(np.full(m, early.u0), np.zeros(rest.size - m))
+    number = np.clip(number, low, high)
+    state = origin + whole @ number
+    e = early.error(state)
+    for _ in range(TRIALS):
+        rise = early.model.hysteresis.rise(state[:m], early.u0) if m else np.empty(0)
+        columns = [*early.play_columns(state, rise), *early.columns]
+        pull = np.sqrt(PULL) * np.maximum(rise, 1e-3)
+        pull = np.sqrt(e.size) * np.append(pull, weak)
+        A = np.vstack([np.array(columns).T, np.diag(pull)]) @ whole
+        target = np.concatenate([e, pull * (rest - state)])
+        # the triangular factor holds the same problem in a few rows
+        R = np.asarray(np.linalg.qr(np.column_stack([A, target]), mode='r'))
+        bounds = low - number - margin, high - number + margin
+        step = lsq_linear(R[:, :-1], R[:, -1], bounds).x
+        # a play may begin to move sooner or later than before; the full step then goes too far
+        for share in (1.0, 0.5, 0.25, 0.125):
+            trial = np.clip(number + share * step, low, high)
+            new = early.error(origin + whole @ trial)
+            if new @ new <= e @ e:
+                break
+        else:
+            break
+        moved_by = np.abs(trial - number).max()
+        number, e, state = trial, new, origin + whole @ trial
+        if moved_by < 1e-6:
+            break
+    return float(e @ e), state, e
