@@ -118,5 +118,5 @@ def axis_record(
 
 
 def columns_of(piece: Piece) -> dict[str, Array]:
-    """Return the voltages, displacements and further channels of a piece by their columns."""
+    """List all signals of a piece by their columns: voltages, displacements, further channels."""
     return {**piece.channels, 'v': piece.v, 'y': piece.y}

@@ -5,7 +5,7 @@
 Free runs: the displacement that a model predicts from the voltage of a record, and its errors.
 
 The early part of a record tells the memory of the stage from earlier motion.  A short gap is
-crossed along a straight line of voltage.
+crossed along its voltage, or along a straight line if the voltage is unknown.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FreeRunErrors:
     Attributes
     ----------
     n : int
-        Number of judged samples: faulty readings and samples before an estimated start are out.
+        Number of judged samples; faulty readings are never judged.
     percent : float
         `piezo_ident.model.metrics.percent_of_stroke` with the stroke of the whole record.
     fit : float
@@ -79,7 +79,7 @@ class FreeRun(Showable):
     estimated : tuple of bool
         For each piece, whether its start was estimated from its early part.
     late : tuple of int
-        For each piece, the first sample at which its start was known or is forgotten.
+        For each piece, the first sample that does not depend on an estimated start.
     errors : FreeRunErrors
         Errors over all samples.
     errors_after_start : FreeRunErrors or None
@@ -177,7 +177,7 @@ def compared(
 
 def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
     """
-    Compute the errors of runs over one record on the same samples, behind all their starts.
+    Compute the errors of runs over one record, on the samples `late` for all of them.
 
     The errors are those of the whole record if no such sample exists.
     """
@@ -195,7 +195,7 @@ def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
     ----------
     model : StageModel
     record : Record
-        Its displacement is not used.  The stage is at rest under the first sample.
+        The stage is at rest under the first sample.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def _judged(record: Record, starts: Sequence[int]) -> int:
 
 
 def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -> FreeRunErrors:
-    """Compute the errors of each piece from a sample on, in blocks to save memory."""
+    """Compute the errors of a record, each piece from a sample on, in blocks to save memory."""
     pieces = list(zip(record, predicted, starts, strict=True))
 
     def total(f: Callable[[Array, Array], Array]) -> float:

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Answer questions to a model: prediction, error, inverse, parameters and dynamics."""
+"""Give a model its methods for users: predict, score, inverse, parameters, bode, to_tf, save."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ModelParameter:
 
     @property
     def is_known(self) -> bool | None:
-        """Whether the data tell the value: its deviation is smaller; None without a deviation."""
+        """Whether the deviation is smaller than the value; None without a number or deviation."""
         if self.std is None or isinstance(self.value, str):
             return None
         return self.std < abs(self.value)
@@ -69,7 +69,7 @@ class Bode(NamedTuple):
 
 
 class FrontDoor:
-    """Base of a model; its methods call rooms below the room of models."""
+    """Base class of `StageModel`; a method imports the later room that does its work."""
 
     def predict(self: Any, record: Record, interval: float | None = None) -> FreeRun:
         """
@@ -126,7 +126,11 @@ class FrontDoor:
 
     @property
     def quantities(self: Any) -> tuple[ModelParameter, ...]:
-        """List gain and phase of G, modes, static gain and loop widths, with their deviations."""
+        """
+        List gain and phase of G, modes, static gain and loop widths, as the identification told.
+
+        `piezo_ident.uncertainty.parameters` computes them with their standard deviations.
+        """
         told = self.identification.get('quantities', ())
         keys = {'part', 'name', 'value', 'unit', 'std'}
         rows = told if isinstance(told, Sequence) and not isinstance(told, str) else ()

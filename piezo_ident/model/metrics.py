@@ -15,7 +15,7 @@ from piezo_ident.common.arrays import Array, robust_range
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
 
-#: factor between measured and predicted motion from which the unit is in doubt
+#: factor between measured and predicted motion, either way, from which the unit is in doubt
 UNIT = 30.0
 #: definition of `percent_of_stroke`, for tables and files
 FORMULA = '100 rms(y - y_hat) / (max y - min y), free run'
@@ -27,8 +27,6 @@ REVERSED = 'the displacement runs against the model: is a sign reversed, or are 
 AGAINST = -0.5
 #: share of the span of a model below which a record counts as at rest
 STILL = 0.02
-
-
 #: samples per block, so that temporary arrays stay small compared with a long record
 BLOCK = 1 << 20
 
@@ -77,8 +75,8 @@ def runs_against(
     """
     Tell whether measured and predicted displacement move in opposite directions.
 
-    Each piece (y, y_hat) may have a zero of its own.  A record that moves by a small share of
-    `span`, the displacement of the model over its range, never counts.  `below` is the
+    Each piece (y, y_hat) may have a zero of its own.  A prediction that moves by less than `STILL`
+    of `span`, the displacement of the model over its range, never counts.  `below` is the
     correlation below which the directions are opposite.
     """
     yy = pp = yp = reach = 0.0
@@ -136,7 +134,7 @@ def worst_error(model: StageModel) -> float | None:
 
 
 def _known_errors(model: StageModel) -> Iterator[tuple[float, float]]:
-    """Yield the errors in a model, the first to be quoted first, each with the worst error."""
+    """Yield the errors stored in a model, in the order of quotation, each with the worst error."""
     origin = model.identification
     diagnosis = origin.get('diagnosis')
     places = (

@@ -61,19 +61,15 @@ class EachAxis(Mapping[str, T], Generic[T]):
     modes: SharedModes | None = field(default=None, kw_only=True)
 
     def __getitem__(self, axis: str) -> T:
-        """Return the result of an axis."""
         return self.axes[axis]
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the axes."""
         return iter(self.axes)
 
     def __len__(self) -> int:
-        """Return the number of axes."""
         return len(self.axes)
 
     def __repr__(self) -> str:
-        """Describe the result of each axis, under the name of the axis."""
         return self.told(repr)
 
     def mapped(self, change: Callable[[str, T], T]) -> EachAxis[T]:
@@ -186,7 +182,7 @@ class MultiAxisModel:
         return next(iter(self.axes.values())).sample_rate
 
     def own(self, axis: str) -> StageModel:
-        """Return the model of an axis without the paths of the others."""
+        """Take the paths of the other axes out of the model of an axis."""
         model = self.axes[axis]
         kept = tuple(e for e in model.effects if not e.channel.startswith(MOTION))
         return replace(model, effects=kept)
@@ -200,7 +196,7 @@ class MultiAxisModel:
             )
 
     def takes(self, piece: Piece) -> bool:
-        """Return whether the model holds at the sampling rate of a piece."""
+        """Tell whether the model holds at the sampling rate of a piece."""
         return all(model.takes(piece) for model in self.axes.values())
 
     def check_rate(self, piece: Piece) -> None:
@@ -217,7 +213,7 @@ class MultiAxisModel:
             )
 
     def motions(self, record: Record) -> dict[str, list[Array]]:
-        """Return the motion of each axis by its own voltage, an array for each piece [m]."""
+        """Compute the motion of each axis by its own voltage, an array for each piece [m]."""
         found = {}
         for axis in self.axes:
             seen, own = axis_record(record, axis), self.own(axis)
@@ -315,7 +311,7 @@ def models_of(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
 
 
 def shares_modes(model: StageModel | MultiAxisModel | None) -> bool:
-    """Return whether modes that the axes share predict."""
+    """Tell whether modes that the axes share predict instead of chains."""
     return isinstance(model, MultiAxisModel) and model.modes is not None
 
 
@@ -334,8 +330,8 @@ def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:
     """
     List the model of each axis without the paths of the others.
 
-    Beside shared modes, effects and known errors of a chain are no part of a prediction.  The
-    models then have creep, errors and band of the modes.
+    Shared modes predict instead of the chains.  Each model then has the creep, the known errors
+    and the band of the modes, not those of its chain.
     """
     if isinstance(model, StageModel):
         return {'y': model}
@@ -362,9 +358,10 @@ def with_own(
     model: StageModel | MultiAxisModel, own: Mapping[str, StageModel]
 ) -> StageModel | MultiAxisModel:
     """
-    Replace the models of `alone`, which keep their effects; the paths stay as they are.
+    Put changed models of `alone` back into a model, whose paths stay as they are.
 
-    Shared modes take the gain that was learnt last of each axis, about the zero of its scaling.
+    The changed models have the effects that `alone` gave them.  Shared modes take the last gain
+    that each axis has learnt, about the zero of its scaling.
     """
     if isinstance(model, StageModel):
         return own['y']

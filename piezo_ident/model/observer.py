@@ -62,8 +62,8 @@ from piezo_ident.record.record import Piece
 HORIZON = 100
 #: time over which displacement is averaged to one measurement [s]
 GROUP = 1e-3
-#: assumed rms error of a model without a known error, in spans: the error of the paper's model.
-#: Smallest assumed rms error: a tenth of a bit of its converters
+#: assumed rms error of a model without a known error, in spans: the error of the paper's model;
+#: and the smallest assumed rms error: a tenth of a bit of its converters
 UNKNOWN, LEAST = 1e-2, 1e-6
 #: path of the voltage over which the error of a model changes, as a share of its range (taste:
 #: the misfit of H has a few waves over a stroke)
@@ -82,7 +82,7 @@ GAIN_SIZE = 0.1
 DRIFT_TIME = 10.0
 #: rms drift of the gain [1/s], if it is followed: it then makes the rms change of the gain
 DRIFT_SIZE = GAIN_SIZE / DRIFT_TIME
-#: measurements in a row that make a step, and their spread over their mean (taste)
+#: refused measurements that make a step at least, and their largest spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
 #: largest and smallest slope of refused measurements over the free run that make a changed sign;
 #: a reading of the other sign has -2 (taste)
@@ -138,7 +138,7 @@ class Observed:
 
 class Observer:
     """
-    Follows offset, creep and gain that a free run lacks, by displacement of a horizon before.
+    Follows offset, creep and gain, which a free run lacks, by displacement from a horizon ago.
 
     The result does not depend on the size of the blocks.
 

@@ -141,7 +141,7 @@ def _let_time_pass(law: Law, s: State) -> None:
 
 
 @ordered_kernel
-def _innovation(law: Law, s: State, b: int, mean: float, noise: float) -> tuple[float, float]:
+def _innovation(s: State, b: int, mean: float, noise: float) -> tuple[float, float]:
     off, power = mean, noise
     for i in range(s.row.size):
         off -= s.row[i] * s.x[b, i]
@@ -199,7 +199,7 @@ def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
     noise = now[SCALE] * numbers[NOISE] / count
     score, power, e = np.inf, 0.0, 0.0
     for b in range(s.weight.size):
-        off, size = _innovation(law, s, b, mean, noise)
+        off, size = _innovation(s, b, mean, noise)
         if off * off < score * size:
             score, power, e = off * off / size, size, off
     if score <= numbers[GATE]:
@@ -236,7 +236,7 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
     hypotheses, n = s.x.shape
     noise = now[SCALE] * numbers[NOISE] / count
     for b in range(hypotheses):
-        off, power = _innovation(law, s, b, mean, noise)
+        off, power = _innovation(s, b, mean, noise)
         shared = np.zeros(n)
         for i in range(n):
             for j in range(n):

@@ -32,7 +32,7 @@ from piezo_ident.record.record import Piece, Record
 
 T = TypeVar('T')
 
-#: share of the identified range below which a wrong unit is more likely than a small signal
+#: share of the largest identified voltage below which a wrong unit is likelier than a small signal
 FAINT = 2e-3
 
 
@@ -169,7 +169,7 @@ class StageModel(FrontDoor):
         )
 
     def effects_in(self, slot: Slot) -> list[EffectSetting]:
-        """List the operators in a slot; a change of the delay is an effect without an operator."""
+        """List the effects with an operator in a slot; a change of the delay has no operator."""
         return [
             s for s in self.effects if s.slot == slot and not find_effect(s.name).in_delay_line
         ]

@@ -110,9 +110,10 @@ class Stream:
 
     def recall(self, v: Array, t: Array) -> None:
         """
-        Bring amplifier and plays into their state after a past voltage; other states are at rest.
+        Run through a past voltage [V] at the times t [s], shapes (n,).
 
-        Voltage [V] and time [s] have shape (n,).  The stage was at rest before the first sample.
+        The stage was at rest before the first sample.  Effects behind H are at rest after the last
+        one, because a past of turning points has lost the times on which they depend.
         """
         self.reset(float(v[0]))
         if self._cascade is not None:

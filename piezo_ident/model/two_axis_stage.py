@@ -322,7 +322,8 @@ def _check(stage: TwoAxisStage, name: str) -> None:
     )
     for key, x, shape in sizes:
         if x.shape != shape or not np.isfinite(x).all() or not (key == 'shape' or np.all(x > 0)):
-            raise ConfigError(f'{name}: {key} must be {shape} positive numbers')
+            kind = 'finite' if key == 'shape' else 'positive'
+            raise ConfigError(f'{name}: {key} must be {shape} {kind} numbers')
     if not (stage.sample_rate > 2 * stage.frequency.max() and stage.gain != 0):
         raise ConfigError(
             f'{name}: sample_rate must be above twice the highest mode, and gain not 0'

@@ -31,7 +31,7 @@ CHUNK = 64
 
 
 class Loop(NamedTuple):
-    """Arrays and numbers of the equations above; `low` and `high` clip s."""
+    """Arrays and numbers of `SharedModes`; s stays in `low` .. `high`, creep moves by `share`."""
 
     blocks: Array
     b: Array

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 
-#: poles stay within
+#: largest distance of a pole from the origin after `to_modal`
 RADIUS = 0.9999
 
 
@@ -30,7 +30,7 @@ class Modal:
     Attributes
     ----------
     blocks : ndarray, shape (n / 2, 2, 2)
-        Of A.
+        Blocks of A in the order of the states.
     b, c, d : ndarray, shapes (n, inputs), (outputs, n), (outputs, inputs)
     """
 
@@ -68,7 +68,7 @@ class Modal:
         return np.asarray(self.response(np.ones(1, complex))[0].real)
 
     def resolvent(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return (z - A)^-1 block by block, shape (k, n / 2, 2, 2)."""
+        """Compute (z - A)^-1 block by block, shape (k, n / 2, 2, 2)."""
         a, b = self.blocks[:, 0, 0], self.blocks[:, 0, 1]
         c, d = self.blocks[:, 1, 0], self.blocks[:, 1, 1]
         zz = z[:, None]
@@ -80,21 +80,21 @@ class Modal:
         return np.asarray(adjugate / ((zz - a) * (zz - d) - b * c)[:, :, None, None])
 
     def states(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return (z - A)^-1 B, shape (k, n, inputs)."""
+        """Compute (z - A)^-1 B, shape (k, n, inputs)."""
         b = self.b.reshape(-1, 2, self.b.shape[1])
         return np.asarray(
             np.einsum('kbij,bjm->kbim', self.resolvent(z), b).reshape(len(z), self.order, -1)
         )
 
     def reach(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return C (z - A)^-1, shape (k, outputs, n)."""
+        """Compute C (z - A)^-1, shape (k, outputs, n)."""
         c = self.c.reshape(len(self.c), -1, 2)
         return np.asarray(
             np.einsum('pbi,kbij->kpbj', c, self.resolvent(z)).reshape(len(z), -1, self.order)
         )
 
     def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return C (z - A)^-1 B + D, shape (k, outputs, inputs)."""
+        """Compute C (z - A)^-1 B + D, shape (k, outputs, inputs)."""
         return np.asarray(self.c @ self.states(z) + self.d)
 
 
@@ -108,7 +108,7 @@ def narrowest(samples: int) -> float:
 
 
 def resolved(blocks: Array, limit: float) -> Array:
-    """Return blocks whose complex poles beyond a distance from the origin are drawn in to it."""
+    """Draw complex poles of blocks that lie beyond a distance from the origin in to it."""
     radius = np.hypot(blocks[:, 0, 0], blocks[:, 0, 1])
     beyond = (blocks[:, 0, 1] != 0) & (radius > limit)
     return blocks * np.where(beyond, limit / np.where(beyond, radius, 1), 1)[:, None, None]
@@ -116,12 +116,14 @@ def resolved(blocks: Array, limit: float) -> Array:
 
 def to_modal(a: Array, b: Array, c: Array, d: Array) -> Modal:
     """
-    Bring a model into modal coordinates; poles beyond `RADIUS` are mirrored to within.
+    Bring a model into modal coordinates.
+
+    Complex poles beyond `RADIUS` are mirrored at that circle; real poles are clipped to it.
 
     Raises
     ------
     ModelError
-        Where A has no basis of eigenvectors, or an odd number of real poles.
+        If A has no basis of eigenvectors, or an odd number of real poles.
     """
     poles, vectors = np.linalg.eig(a)
     complexes = [i for i in np.argsort(np.angle(poles)) if poles[i].imag > 1e-12]

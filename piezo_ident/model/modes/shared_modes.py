@@ -55,7 +55,7 @@ SETTLING = 20_000
 @dataclass(frozen=True, eq=False)
 class SharedModes:
     """
-    The equations above.
+    The equations of the module with their numbers.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class SharedModes:
     memory : float
         Time constant of the level [samples].
     range : tuple of float
-        Between these s softens the stage; beyond them the softening stays.
+        Lowest and highest level s that changes the softening.
     v0, y0 : ndarray, shapes (inputs,) and (outputs,)
         Voltages [V] and displacements [m] about which the equations hold.
     creep : ndarray, shape (inputs, m)
@@ -137,7 +137,7 @@ class SharedModes:
         return f', with creep of {shares} % of the voltages' if self.taus.size else ''
 
     def creep_of(self, axis: int) -> tuple[Array, Array]:
-        """Return shares and time constants [samples] of the creep of an axis, by its place."""
+        """List shares and time constants [samples] of the creep of an axis, by its place."""
         seen = self.creep[axis] != 0.0
         return self.creep[axis][seen], self.taus[seen]
 

@@ -13,9 +13,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.model.modes.kernels import LoopState
 from piezo_ident.model.modes.shared_modes import SharedModes
-
-#: number of samples that run at once; the signals then stay in the cache
-CHUNK = 8192
+from piezo_ident.model.stream import CHUNK
 
 
 class ModesStream:
@@ -26,8 +24,8 @@ class ModesStream:
     ----------
     modes : SharedModes
     side : {-1, 0, 1}, optional
-        Where the plays begin: at the lower or upper end of all that is possible at rest, or as
-        they are in a stage that comes from the middle voltage of the fit.
+        Where the plays begin: -1 and 1 are the lower and upper end of all that is possible at
+        rest, 0 is a stage that comes from the middle voltage of the fit.
     """
 
     def __init__(self, modes: SharedModes, side: int = 0) -> None:
@@ -69,7 +67,7 @@ class ModesStream:
         return y
 
     def _settled(self, rest: Array) -> LoopState:
-        """Settle under voltages of rest about those of the fit, all creep at rest."""
+        """Settle under resting voltages about `v0`, all creep at rest."""
         modes, state = self.modes, LoopState.at_zero(self.modes.loop)
         state.creep[:] = rest[0][:, None]
         run = modes.run(rest, state)
@@ -87,7 +85,7 @@ class MemorySpread:
         self._sides = [ModesStream(modes, side) for side in (-1, 1)]
 
     def follow(self, v: Array, y: Array) -> Array:
-        """Compute it for voltages [V] and the displacements of a run [m], shapes (n, k)."""
+        """Compute that change for voltages [V] and displacements of a run [m], shapes (n, k)."""
         try:
             ends = [side.process(v) - y for side in self._sides]
         except ModelError:  # ran away
