@@ -10,9 +10,9 @@ removes,
 
     w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
 
-where Q is the inverse of G and y(u) is the free run of the whole model.  A step that increases the
-error is halved.  The iteration converges if the effects are small beside the stage.  An amplifier
-lag before H is inverted together with H.
+where Q is the inverse of G and y(u) is the free run of the whole model.  After a pass that hardly
+reduces a large error, the step is halved.  The iteration converges if the effects are small beside
+the stage.  An amplifier lag before H is inverted with H, and so are plays that widen with speed.
 """
 
 from __future__ import annotations
@@ -51,9 +51,10 @@ from scipy.ndimage import maximum_filter1d
 PASSES = 30
 #: rms error [of the span of the wanted motion] at which the iteration ends
 EXACT = 1e-5
-#: the iteration goes on while a pass leaves at most this share of the error
+#: a pass that leaves more than this share of the error halves the step, or ends the iteration if
+#: the error is below `MATTERS`
 WORTH = 0.9
-#: smallest share of a step that is tried
+#: the iteration ends when the share of a step falls below
 SHORTEST = 0.2
 #: A larger error than `MATTERS`, as a share of the span of the motion, counts as a miss.  A span
 #: above `LARGE` [spans of the model] counts as `LARGE`
@@ -173,22 +174,24 @@ def invert(
     """
     y = checked_motion(wanted)
     check_rate(model.sample_rate, sample_rate)
-    s, (low, high, slew) = model.scaling, checked_limits(model, limits, slew)
-    task, warnings_of_h = _task(model, y, (low, high, slew), clip, channels or {})
+    task = _task(model, y, checked_limits(model, limits, slew), clip, channels or {})
     if like is not None and isinstance(task.H, RateInverse):
         around = task.Q.ahead - like.lead, task.Q.behind
-        task.H.begin_at(np.pad(s.u(like.v), around, mode='edge'))
-    best, passes = _iterate(task)
-    used, v, predicted = _without_rest(task, best, y.size, (low, high))
-    lead = task.Q.ahead - used.start
+        task.H.begin_at(np.pad(model.scaling.u(like.v), around, mode='edge'))
+    return _described(task, *_iterate(task))
 
-    warnings, missed = list(warnings_of_h), best.missed[used]
+
+def _described(task: _Task, best: _Pass, passes: int) -> Inverse:
+    """Cut and judge the best pass; raise DataError if the limits do not reach the motion."""
+    model, s, y = task.model, task.model.scaling, task.wanted
+    used, v, predicted = _without_rest(task, best)
+    lead, warnings = task.Q.ahead - used.start, list(task.warnings)
     largest = maximum_filter1d(np.abs(best.error), task.near)[used]
-    missed = missed & (largest > task.small)
+    missed = best.missed[used] & (largest > task.small)
     if missed.any():
         most = abs(s.Y) * float(largest[missed].max())
-        warnings.append(_out_of_reach(task, best, used, missed, most, slew))
-        if not clip and most > tolerance(model, y):
+        warnings.append(_out_of_reach(task, best, used, missed, most))
+        if not task.clip and most > tolerance(model, y):
             raise DataError('; '.join([*warnings, *faint(model, y)]), options='--clip')
     error = best.error[used][~maximum_filter1d(missed, task.near)]
     left = float(np.sqrt(np.mean(error**2))) / task.span if error.size else 0.0
@@ -226,6 +229,11 @@ class _Task:
     Attributes
     ----------
     model : StageModel
+    wanted : ndarray
+        Displacement without the rest around it [m].
+    bounds : tuple of float
+        Lowest and highest voltage [V], and slew [V/s].
+    clip : bool
     H, Q : HysteresisInverse or RateInverse, and LinearInverse
     rest : float
         Normalised voltage at which the motion begins.
@@ -234,9 +242,14 @@ class _Task:
     channels : mapping of str to ndarray, shape (n,)
     span, small : float
         Span of the motion, and error that counts as a miss, both normalised.
+    warnings : tuple of str
+        A warning if H differs from that of the model.
     """
 
     model: StageModel
+    wanted: Array
+    bounds: tuple[float, float, float]
+    clip: bool
     H: HysteresisInverse | RateInverse
     Q: LinearInverse
     rest: float
@@ -245,6 +258,7 @@ class _Task:
     channels: Mapping[str, Array]
     span: float
     small: float
+    warnings: tuple[str, ...]
 
     @property
     def near(self) -> int:
@@ -272,8 +286,8 @@ def _task(
     bounds: tuple[float, float, float],
     clip: bool,
     channels: Mapping[str, ArrayLike],
-) -> tuple[_Task, tuple[str, ...]]:
-    """Prepare the inversion within bounds (lowest, highest voltage, slew), and warn about H."""
+) -> _Task:
+    """Prepare the inversion within bounds (lowest, highest voltage, slew)."""
     s, (low, high, slew) = model.scaling, bounds
     inverted, warnings = with_rising_hysteresis(model)
     ends = float(s.u(low)), float(s.u(high))
@@ -287,8 +301,11 @@ def _task(
     rest, around = rest_at(model, y, H.limits, clip), (Q.ahead, Q.behind)
     x = np.pad(s.x(y), around, mode='edge')
     span = float(np.ptp(x)) if np.ptp(x) > STANDS else 1.0
-    task = _Task(
+    return _Task(
         model,
+        y,
+        bounds,
+        clip,
         H,
         Q,
         rest,
@@ -297,12 +314,12 @@ def _task(
         padded(channels, y.size, around),
         span,
         MATTERS * min(span, LARGE),
+        warnings,
     )
-    return task, warnings
 
 
 def _iterate(task: _Task) -> tuple[_Pass, int]:
-    """Iterate until the error stops falling; return the best pass and the number of passes."""
+    """Iterate while the error falls enough; return the best pass and the number of passes."""
     s = task.model.scaling
     counts = np.ones(task.x.size, dtype=np.bool_)
     w = task.H.reset(task.rest) + task.Q(task.x - task.x[0])
@@ -332,17 +349,15 @@ def _iterate(task: _Task) -> tuple[_Pass, int]:
     return best, passes
 
 
-def _without_rest(
-    task: _Task, best: _Pass, size: int, limits: tuple[float, float]
-) -> tuple[slice, Array, Array]:
+def _without_rest(task: _Task, best: _Pass) -> tuple[slice, Array, Array]:
     """Cut off the tail and the lead at rest; return samples, voltage and displacement."""
     s, lead = task.model.scaling, task.Q.ahead
     for still in (*STILL, 0.0):
         moves = np.flatnonzero(np.abs(best.u - task.rest) > still * min(task.span, 1.0))
         first = min(lead, int(moves[0]) - 1 if moves.size else lead)
-        used = slice(max(first, 0), lead + size)
+        used = slice(max(first, 0), lead + task.wanted.size)
         # rounding must not cross a limit
-        v = np.clip(s.v0 + s.V * best.u[used], *limits)
+        v = np.clip(s.v0 + s.V * best.u[used], *task.bounds[:2])
         channels = {name: z[used] for name, z in task.channels.items()}
         predicted = task.model.stream().process(v, task.t[used], channels)
         moved = task.x[used] - best.error[used] - s.x(predicted)
@@ -351,11 +366,9 @@ def _without_rest(
     return used, v, predicted
 
 
-def _out_of_reach(
-    task: _Task, best: _Pass, used: slice, missed: Mask, most: float, slew: float
-) -> str:
+def _out_of_reach(task: _Task, best: _Pass, used: slice, missed: Mask, most: float) -> str:
     """Describe the samples out of reach, their largest error `most` [m], and a remedy."""
-    s, (low, high) = task.model.scaling, task.H.limits
+    s, (low, high), slew = task.model.scaling, task.H.limits, task.bounds[2]
     x, t = task.x[used], task.t[used][missed]
     at_top = best.u[used][missed] > 0.5 * (low + high)
     jumps = maximum_filter1d(np.abs(np.diff(x, append=x[-1])), task.near)[missed]
