@@ -4,9 +4,10 @@
 """
 Predict the error of a stage under the voltage of an inverse.
 
-The prediction has two parts.  The first part is the error of the shape of the motion.  This is the
-known error of the model, because a diagnosis fits the zero of each record.  The second part is the
-shift of the zero by creep from earlier motion.  A model with creep predicts this shift.
+The error about its mean has three parts, whose squares add up: the known error of the model, the
+part of the motion above the lowest mode that rings, and the drift by creep from earlier motion.
+The known error holds no mean, because a diagnosis fits the zero of each record.  The mean is the
+shift by creep from earlier motion.  A model with creep predicts this shift.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
 
 
 def _is_slow(model: StageModel) -> bool:
-    """Return whether G is unknown and no diagnosis measured the error on fast motion."""
+    """Tell whether G is unknown and no diagnosis measured the error on fast motion."""
     missing = model.identification.get('not_identified')
     if 'diagnosis' in model.identification or not isinstance(missing, Sequence):
         return False

@@ -235,7 +235,7 @@ class HysteresisInverse:
         self.hysteresis = hysteresis = rising(hysteresis)
         lags = hysteresis.relaxations
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
-        self.limits = _rising(hysteresis, float(limits[0]), float(limits[1]))
+        self.limits = _rising_limits(hysteresis, float(limits[0]), float(limits[1]))
         self._bounds = (*self.limits, float(step), float(pole))
         self._growth = np.array(growth, dtype=np.float64)
         self._memory = self._last = np.zeros(0)
@@ -327,7 +327,7 @@ def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ..
     )
 
 
-def _rising(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
+def _rising_limits(hysteresis: Hysteresis, low: float, high: float) -> tuple[float, float]:
     """Cut the limits to the range in which H rises, at most one span beyond the span of H."""
     least, most = hysteresis.span
     if not -np.inf < low < high < np.inf or least <= low < high <= most:

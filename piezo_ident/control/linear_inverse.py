@@ -80,7 +80,7 @@ class LinearInverse:
         return reach_of(np.abs(self.taps), self.ahead)
 
     def shortened(self, most: int) -> LinearInverse:
-        """Limit the samples ahead to `most`; the static gain stays."""
+        """Limit the samples ahead to `most`, those behind to what counts; keep the gain."""
         ahead, behind = min(self.ahead, most), past_of(np.abs(self.taps), self.behind)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
         return LinearInverse(taps * (self.taps.sum() / taps.sum()), ahead, behind)
@@ -228,7 +228,7 @@ def smoothed(x: Array, corner: float, sample_rate: float) -> Array:
 
 
 def is_filter(effect: type[Effect]) -> bool:
-    """Return whether an effect is a filter that is inverted together with G."""
+    """Tell whether an effect is a filter that is inverted together with G."""
     return effect.in_dynamics and not effect.in_delay_line and effect.change != 'passed'
 
 
@@ -245,12 +245,12 @@ def _response(model: StageModel, n: int) -> NDArray[np.complex128]:
         effect = find_effect(setting.name)
         if not effect.in_dynamics or effect.in_delay_line:
             continue
-        of = []
+        responses = []
         for v, x in ((none, impulse), (impulse / _slope(model.hysteresis), none)):
             operator = effect(model.sample_rate, setting.parameters)
             operator.reset(0.0, 0.0)
-            of.append(np.fft.rfft(operator.process(Block(t=t, v=v, x=x)).x))
-        G = G * of[0] + of[1]
+            responses.append(np.fft.rfft(operator.process(Block(t=t, v=v, x=x)).x))
+        G = G * responses[0] + responses[1]
     return np.asarray(G, dtype=np.complex128)
 
 

@@ -9,9 +9,12 @@ The offline inverse repeats a pass over the whole motion,
     w <- w + Q (y_wanted - y(u)),        u = H^-1 w,
 
 where Q looks ahead by a few samples.  Live, each pass runs that many samples behind the pass
-before it.  Each pass has its own H^-1 and its own model, and handles every sample once.  The
-result is the offline iteration, except that the ends of Q are cut to fit into the preview.  A
-trial motion measures the error of this cut beforehand.
+before it.  Each pass has its own H^-1 and its own model, and handles every sample once.
+
+The offline iteration ends at a small error and may shorten its steps.  Here the number of passes
+is fixed, each step is whole, and the ends of Q are cut to fit into the preview.  A trial motion
+chooses the number and measures the error beforehand.  An amplifier lag is a part of Q, and plays
+that widen with speed are left to the passes.
 """
 
 from __future__ import annotations
@@ -167,7 +170,7 @@ class LiveInverse:
         ]
 
     def _tried(self) -> tuple[int, float]:
-        """Choose the number of passes on a trial motion; the number and its error."""
+        """Choose the number of passes on a trial motion; return the number and its error."""
         stream = self.model.stream()
         low, high, rest = (stream.reset(v) for v in (*self._limits, self._rest))
         fade, motion = trial_motion()
@@ -191,7 +194,7 @@ class LiveInverse:
 
     def recall(self, v: Array, t: Array) -> None:
         """
-        Bring amplifier and plays into their state after a past voltage; G rests.
+        Run through a past voltage, after which effects behind H are at rest.
 
         Parameters
         ----------
@@ -296,7 +299,7 @@ class _Pass:
         return y0
 
     def recall(self, v: Array, t: Array) -> None:
-        """Bring the plays into their state after a past voltage."""
+        """Run H and the model through a past voltage, as `Stream.recall` does."""
         u = self._model.scaling.u(v)
         self._H.reset(float(u[0]))
         self._H.follow(u)

@@ -41,7 +41,6 @@ STEPS, AGAIN = 12, 3
 #: tolerance, and most products with the tangent
 STEP_CORNER, STEP_SIZE, STEP_ERROR, PRODUCTS = 3.0, 1.0, 1e-3, 30
 
-
 #: squared error, voltage, and H
 _Found = tuple[float, Array, Array]
 

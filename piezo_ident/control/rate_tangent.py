@@ -65,7 +65,7 @@ def _edges(
     weight: Array,
     line: Array,
 ) -> None:
-    """Write the edge of each play (-1, 1, or 0 for none), and add the slopes of curves."""
+    """Write the edge of each play (-1 lower, 1 upper, 0 none), and add the slopes of curves."""
     for k in range(u.size):
         x, s = u[k], power[k]
         for i in range(r.size):

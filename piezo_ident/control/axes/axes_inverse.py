@@ -43,7 +43,7 @@ class AxesFilter(NamedTuple):
         return reach_of(_size(self.taps), self.ahead)
 
     def shortened(self, most: int) -> AxesFilter:
-        """Limit the samples ahead to `most`; the static gain stays."""
+        """Limit the samples ahead to `most`, those behind to what counts; keep the gain."""
         ahead, behind = min(self.ahead, most), past_of(_size(self.taps), self.behind)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
         static = self.taps.sum(axis=0) @ np.linalg.inv(taps.sum(axis=0))
@@ -90,7 +90,7 @@ def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, A
     Raises
     ------
     ModelError
-        When G has no static gain, or needs a filter of more than `LONGEST` samples.
+        When the static gain has no inverse, or the filter needs more than `LONGEST` samples.
     """
     static = static_gain(G, spans)
     n, left = SHORTEST, np.inf

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Invert the chains of all axes block by block, with the paths between them made up for.
+Invert the chains of all axes block by block, and make up for the paths between the axes.
 
 The goal of each axis is the wanted motion less what the paths from the other axes add.  The motion
 of the other axes is the wanted one at first, then the goal of the round before, as in
@@ -38,11 +38,6 @@ class LiveChains:
         The model with the paths.
     axes : sequence of str
         Order of the rows, by the names of the displacements.
-
-    Attributes
-    ----------
-    position : ndarray, shape (k,)
-        Displacements of the stage at rest [m].
     """
 
     def __init__(
@@ -98,7 +93,7 @@ class LiveChains:
 
     def moved(self, v: Array, own: Array) -> tuple[Array, Array]:
         """
-        Return the motions under the next voltages that are sent, and what each axis feels [m].
+        Give the motions under the next voltages that are sent, and what each axis feels [m].
 
         `own` are the motions of the chains under these voltages.
         """

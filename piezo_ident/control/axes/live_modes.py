@@ -140,7 +140,7 @@ class LiveModesInverse:
         ]
 
     def _tried(self, least: float) -> tuple[float, AxesFilter, int]:
-        """Choose Q and the number of passes on a trial motion; the error, Q and the number."""
+        """Choose Q and the number of passes on a trial motion; return error, Q and number."""
         modes, one = self._modes, self._bounds
         shapes = [trial_motion(1.0 + APART * k) for k in range(len(one.low))]
         fade, motion = (np.column_stack(rows) for rows in zip(*shapes, strict=True))
@@ -163,7 +163,7 @@ class LiveModesInverse:
         return best
 
     def _missed(self, passes: list[_Pass], wanted: Array) -> float:
-        """Return the largest error of an axis on a motion from rest [% of its span]."""
+        """Compute the largest error of an axis on a motion from rest [% of its span]."""
         known = np.pad(wanted, ((0, self.preview), (0, 0)), mode='edge')
         try:
             u, _ = _through(passes, known)
@@ -180,7 +180,7 @@ class LiveModesInverse:
         self._run: ModesRun | None = ModesRun(self._modes, self._axes)
 
     def goals(self, wanted: Array) -> Array:
-        """Return the wanted motions: the modes are inverted with all axes."""
+        """Leave the wanted motions as they are: the modes are inverted with all axes."""
         return wanted
 
     def moved(self, v: Array, own: Array) -> tuple[Array, Array]:

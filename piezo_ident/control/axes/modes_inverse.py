@@ -7,8 +7,8 @@ Invert modes that several axes share: find voltages that move all axes along wan
     m <- m + P (y_wanted - y(u)),        u = u_0 + Q m
 
 y(u) is the free run of the modes.  Q inverts a linear model of them by filters that look ahead,
-see `axes_inverse`.  P = G Q is nearly one where the stage moves, and small
-above its modes.  The iteration therefore leaves alone the motion that is too fast for the stage.
+see `axes_inverse`.  P = G Q is nearly one where the stage moves, and small above its modes.  The
+iteration therefore leaves alone the motion that is too fast for the stage.
 
 A linear model lacks softening and plays.  The first pass inverts the linear model without them,
 and runs the modes under this voltage.  Each signal z then gets the gain k for which k z is nearest
@@ -43,12 +43,13 @@ from piezo_ident.model.multi_axis import alone, MultiAxisModel
 from piezo_ident.operators.chain import Block
 from scipy.ndimage import maximum_filter1d
 
-#: most passes; `STALLS` passes in turn without a better pass end the iteration, too (taste)
+#: most passes, and most passes in turn without a better one (taste)
 PASSES, STALLS = 40, 6
 #: rms error [of the span of the wanted motion] at which the iteration ends
 EXACT = 1e-5
-#: earlier passes that a step combines (taste: more find nothing in noise of 1e-6)
-DEPTH = 8
+#: earlier passes that a step combines (taste: more find nothing in noise of 1e-6), and share of
+#: their largest independent change below which another one does not count
+DEPTH, COUNTS = 8, 1e-8
 #: most steps to the voltages of rest, and their accuracy [of the span of the model]
 STEPS, AT_REST = 50, 1e-9
 #: the iteration contracts if it leaves at most this share of the error of the linear inverse
@@ -130,7 +131,7 @@ class Limited:
 
 
 class _Pass(NamedTuple):
-    """Voltages about v0, error, samples out of reach, and rms error of the rest [spans]."""
+    """Voltages about v0, error, samples out of reach, rms error of the rest [spans], passes."""
 
     u: Array
     error: Array
@@ -260,7 +261,7 @@ class _Solved(NamedTuple):
 
 
 def _iterated(task: _Task) -> _Solved:
-    """Iterate until the error stops falling; raise ModelError if it never falls."""
+    """Iterate until the error stops falling; raise ModelError if it hardly falls."""
     first = _Filters.of(task, np.zeros(task.modes.signals))
     begun = first.tried(task, first.x, 1)
     filters, best = first, begun
@@ -281,7 +282,7 @@ def _iterated(task: _Task) -> _Solved:
     if not (np.isfinite(best.left) and best.left <= max(CONTRACTS * begun.left, MATTERS)):
         raise ModelError(
             'invert: the iteration with the shared modes does not contract: '
-            f'{100 * best.left:.2g} % of the motion remain after {PASSES} passes, '
+            f'{100 * best.left:.2g} % of the motion remain after {passes} passes, '
             f'{100 * begun.left:.2g} % by the inverse of the linear modes; make the motion '
             'smaller or slower'
         )
@@ -303,13 +304,13 @@ class _Anderson:
         self._points, self._steps = list[Array](), list[Array]()
 
     def next(self, m: Array, step: Array, spans: Array) -> Array:
-        """Return the next point after m, whose step is known; errors count in spans."""
+        """Choose the next point after m, whose step is known; errors count in spans."""
         self._points, self._steps = [*self._points, m][-DEPTH:], [*self._steps, step][-DEPTH:]
         if not self._points[1:]:
             return m + step
         moved, changed = np.diff(self._points, axis=0), np.diff(self._steps, axis=0)
         columns = (changed / spans).reshape(len(changed), -1).T
-        shares = np.linalg.lstsq(columns, (step / spans).ravel(), rcond=STILL[-1])[0]
+        shares = np.linalg.lstsq(columns, (step / spans).ravel(), rcond=COUNTS)[0]
         return np.asarray(m + step - np.tensordot(shares, moved + changed, axes=1))
 
 
