@@ -28,17 +28,15 @@ EFFECTS, ORDER = 50, 200
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
+#: arrays of a hysteresis beyond plays and a cubic
+_WIDE = ('curves', 'bias', 'relaxations')
 _INSIDE: Mapping[str, tuple[str, ...]] = {
     'input': ('v0', 'V', 'range'),
     'output': ('y0', 'Y'),
     'delay': ('samples', 'fraction'),
-    'hysteresis': (
-        *('thresholds', 'weights', 'p1', 'p2'),
-        *('p0', 'curves', 'bias', 'span', 'relaxations'),
-    ),
+    'hysteresis': ('thresholds', 'weights', 'p1', 'p2', 'p0', 'span', *_WIDE),
     'dynamics': ('a', 'b'),
 }
-_WIDE = ('curves', 'bias', 'relaxations')
 _EFFECT = ('name', 'slot', 'parameters')
 
 

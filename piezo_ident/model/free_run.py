@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from piezo_ident.common.arrays import Array
+from piezo_ident.common.arrays import Array, CHUNK
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
 from piezo_ident.model.initial_memory import crept, EARLY, early_part, fit_start
-from piezo_ident.model.metrics import BLOCK, doubts, nrmse_fit, percent
+from piezo_ident.model.metrics import doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start, StartLike
 from piezo_ident.record.readings.faults import without_faults
@@ -215,10 +215,10 @@ def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
 
 def _late(model: StageModel, piece: Piece, start: Start) -> int:
     """Find the first sample of a bridged piece that does not depend on its estimated start."""
-    # a resting voltage never makes the stage forget
-    if start.memory is not None and np.ptp(piece.v) == 0.0:
-        return piece.n
     memory = start.memory is not None
+    # a resting voltage never makes the stage forget
+    if memory and np.ptp(piece.v) == 0.0:
+        return piece.n
     return early_part(model, piece, memory=memory) if memory or start.creep.size else 0
 
 
@@ -291,7 +291,7 @@ def _errors(record: Record, predicted: Sequence[Array], starts: Sequence[int]) -
         return sum(
             float(np.sum(f(piece.y[part], y_hat[part])[piece.mask[part]]))
             for piece, y_hat, start in pieces
-            for part in (slice(i, i + BLOCK) for i in range(start, piece.n, BLOCK))
+            for part in (slice(i, i + CHUNK) for i in range(start, piece.n, CHUNK))
         )
 
     n = _judged(record, starts)

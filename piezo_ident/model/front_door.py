@@ -126,11 +126,7 @@ class FrontDoor:
 
     @property
     def quantities(self: Any) -> tuple[ModelParameter, ...]:
-        """
-        List gain and phase of G, modes, static gain and loop widths, as the identification told.
-
-        `piezo_ident.uncertainty.parameters` computes them with their standard deviations.
-        """
+        """List gain and phase of G, modes, static gain and loop widths, with their deviations."""
         told = self.identification.get('quantities', ())
         keys = {'part', 'name', 'value', 'unit', 'std'}
         rows = told if isinstance(told, Sequence) and not isinstance(told, str) else ()

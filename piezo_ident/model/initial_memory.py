@@ -255,13 +255,7 @@ class _EarlyPart:
     """
 
     def __init__(
-        self,
-        model: StageModel,
-        piece: Piece,
-        sound: Mask | None,
-        memory: bool,
-        creep: bool,
-        z: int,
+        self, model: StageModel, piece: Piece, used: Mask | None, memory: bool, creep: bool, z: int
     ) -> None:
         h = model.hysteresis
         self.model, self.memory, self.z = model, memory, z
@@ -271,7 +265,7 @@ class _EarlyPart:
         self.u = model.hysteresis_input(self.part)
         u0 = self.u0 = float(self.u[0])
         # rows are thinned: a few numbers do not need a hundred thousand samples
-        keep = np.arange(n) if sound is None else np.flatnonzero(sound[:n])
+        keep = np.arange(n) if used is None else np.flatnonzero(used[:n])
         keep = keep if keep.size else np.arange(n)
         self.keep = keep[:: max(1, keep.size // 5000)]
         self.x = model.scaling.x(self.part.y)[self.keep]

@@ -10,7 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from piezo_ident.common.arrays import Array, robust_range
+from piezo_ident.common.arrays import Array, CHUNK, robust_range
 
 if TYPE_CHECKING:
     from piezo_ident.model.stage_model import StageModel
@@ -27,8 +27,6 @@ REVERSED = 'the displacement runs against the model: is a sign reversed, or are 
 AGAINST = -0.5
 #: share of the span of a model below which a record counts as at rest
 STILL = 0.02
-#: samples per block, so that temporary arrays stay small compared with a long record
-BLOCK = 1 << 20
 
 
 def percent(rms: float, stroke: float) -> float:
@@ -83,8 +81,8 @@ def runs_against(
     for y, y_hat in parts:
         y_mean, mean = float(y.mean()), float(y_hat.mean())
         # in blocks, to save memory
-        for i in range(0, y.size, BLOCK):
-            dy, dp = y[i : i + BLOCK] - y_mean, y_hat[i : i + BLOCK] - mean
+        for i in range(0, y.size, CHUNK):
+            dy, dp = y[i : i + CHUNK] - y_mean, y_hat[i : i + CHUNK] - mean
             yy, pp, yp = yy + float(dy @ dy), pp + float(dp @ dp), yp + float(dy @ dp)
         reach = max(reach, float(np.ptp(y_hat)))
     return reach > STILL * abs(span) and yp < below * math.sqrt(yy * pp)

@@ -378,11 +378,10 @@ def with_own(
 def _with_gains(
     model: MultiAxisModel, modes: SharedModes, own: Mapping[str, StageModel]
 ) -> MultiAxisModel:
+    known = {axis: {SHARED_MODES: own[axis].identification} for axis in model.axes}
     axes = {
-        axis: replace(
-            x, identification={**x.identification, SHARED_MODES: own[axis].identification}
-        )
-        for axis, x in model.axes.items()
+        a: replace(x, identification={**x.identification, **known[a]})
+        for a, x in model.axes.items()
     }
     order = [own[axis] for axis in sorted(own)]
     learnt = [x.identification['adaptation'][-1]['gain']['value'] for x in order]

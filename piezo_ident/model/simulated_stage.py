@@ -220,8 +220,7 @@ class StageRun:
 
     def __init__(self, stage: SimulatedStage, rng: np.random.Generator) -> None:
         self.stage = stage
-        self.clipped_input = 0
-        self.clipped_output = 0
+        self.clipped_input = self.clipped_output = 0
         self._rng = rng
         self._stream = stage.model.stream()
 

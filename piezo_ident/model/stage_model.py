@@ -190,14 +190,7 @@ class StageModel(FrontDoor):
 
     @property
     def total_delay(self) -> Delay:
-        """
-        Identified delay, with its change by effects.
-
-        Raises
-        ------
-        ModelError
-            If the sum is negative.
-        """
+        """Identified delay, with its change by effects; ModelError if the sum is negative."""
         added = sum(find_effect(s.name).added_delay(s.parameters) for s in self.effects)
         if added == 0.0:
             return self.delay
@@ -288,14 +281,7 @@ class StageModel(FrontDoor):
         return Stream(self, start)
 
     def predict_piece(self, piece: Piece, start: StartLike = None) -> Array:
-        """
-        Predict the displacement of a piece [m], shape (n,).
-
-        Raises
-        ------
-        ModelError
-            If the piece has another sampling rate.
-        """
+        """Predict the displacement of a piece [m], shape (n,), as far as `check_rate` allows."""
         self.check_rate(piece)
         return self.stream(start).follow(piece)
 
@@ -304,13 +290,7 @@ class StageModel(FrontDoor):
         return self.is_static or abs(piece.sample_rate / self.sample_rate - 1.0) < 1e-6
 
     def check_rate(self, piece: Piece) -> None:
-        """
-        Refuse a piece with another sampling rate than the model.
-
-        Raises
-        ------
-        ModelError
-        """
+        """Refuse a piece with another sampling rate than the model with a ModelError."""
         if not self.takes(piece):
             raise ModelError(
                 f'the record is sampled at {piece.sample_rate:g} Hz, the model at '

@@ -162,6 +162,14 @@ class SharedModes:
         levels = (self.range[0], 1.0, self.range[1]) if self.levels else (1.0,)
         return max(float(np.abs(np.linalg.eigvals(self.a_at(s))).max()) for s in levels)
 
+    def check_inputs(self, v: Array) -> None:
+        """Refuse voltages of another shape than (n, inputs) with a DataError."""
+        inputs = self.linear.b.shape[1]
+        if v.ndim != 2 or v.shape[1] != inputs:
+            raise DataError(
+                f'voltages of shape {v.shape} do not fit {inputs} inputs; give (samples, inputs)'
+            )
+
     def simulate(self, v: ArrayLike) -> Array:
         """
         Simulate the displacements under voltages in free run, from rest under the first sample.
@@ -213,11 +221,7 @@ class SharedModes:
         All states are zero before, if none is given.
         """
         v = np.ascontiguousarray(v, dtype=np.float64)
-        if v.ndim != 2 or v.shape[1] != self.linear.b.shape[1]:
-            raise DataError(
-                f'voltages of shape {v.shape} do not fit {self.linear.b.shape[1]} inputs; '
-                'give (samples, inputs)'
-            )
+        self.check_inputs(v)
         n, q, k = len(v), *self.mu.shape
         run = Passage(
             np.zeros((n, self.linear.order)),
@@ -260,28 +264,14 @@ def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
         found = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
         sound = all(np.isfinite(x).all() for x in found.values())
         sound = sound and all((found[x] > 0).all() for x in ('memory', 'taus'))
-        levels, low, high = int(found['levels']), *map(float, found['range'])
+        levels, memory = int(found.pop('levels')), float(found.pop('memory'))
+        low, high = map(float, found.pop('range'))
         if not sound or n % 2 or not 0 <= levels <= q or not 0 <= low <= 1 <= high:
             raise ValueError('a number is out of range')
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f'{name}: modes: {error!r}; see docs/two_axes.md') from None
-    linear = Modal(*(found[x.name] for x in fields(Modal)))
-    modes = SharedModes(
-        linear,
-        found['e'],
-        found['h'],
-        found['f'],
-        found['g'],
-        levels,
-        found['mu'],
-        found['r'],
-        float(found['memory']),
-        (low, high),
-        found['v0'],
-        found['y0'],
-        found['creep'],
-        found['taus'],
-    )
+    linear = Modal(*(found.pop(x.name) for x in fields(Modal)))
+    modes = SharedModes(linear, levels=levels, memory=memory, range=(low, high), **found)
     if not modes.radius < 1:
         raise ModelError(
             f'{name}: modes: unstable (pole at radius {modes.radius:.6g}); diagnose again'

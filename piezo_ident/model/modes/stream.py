@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from piezo_ident.common.arrays import Array
-from piezo_ident.common.errors import DataError, ModelError
+from piezo_ident.common.errors import ModelError
 from piezo_ident.model.modes.kernels import LoopState
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.stream import CHUNK
@@ -51,11 +51,7 @@ class ModesStream:
     def process(self, v: Array) -> Array:
         """Compute the next displacements [m] of voltages [V], shapes (n, outputs), (n, inputs)."""
         modes = self.modes
-        if v.ndim != 2 or v.shape[1] != len(modes.v0):
-            raise DataError(
-                f'voltages of shape {v.shape} do not fit {len(modes.v0)} inputs; '
-                'give (samples, inputs)'
-            )
+        modes.check_inputs(v)
         u, y = v - modes.v0, np.empty((len(v), len(modes.y0)))
         if self._state is None and len(u):
             self._state = self._settled(np.repeat(u[:1], modes.settling, axis=0))
