@@ -58,8 +58,7 @@ def expect(model: StageModel, v: Array, y: Array) -> Expectation:
     """
     known, late = known_rms(model), _late(model, v)[-y.size :]
     limit = MATTERS * abs(model.scaling.Y) if known is None else known
-    warnings = []
-    fast = 0.0
+    warnings, fast = list[str](), 0.0
     if known is not None:
         mode, fast = lowest_mode(model), _above_mode(model, y)
         if fast > known:

@@ -310,10 +310,7 @@ def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ..
     """
     Replace H of a model by an H that rises with the voltage; a warning says if it differs.
 
-    Raises
-    ------
-    ModelError
-        When H falls by more than its narrowest plays.
+    Raises ModelError if H falls by more than its narrowest plays.
     """
     h = model.hysteresis
     found = rising(h, model.scaling.v)

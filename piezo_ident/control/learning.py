@@ -169,9 +169,8 @@ class Learning:
         """
         Learn from the displacement measured under `drive`, and plan the next drive.
 
-        The result is the error of the displacement [% of stroke].
-
-        A straight line bridges a few wild readings.
+        The result is the error of the displacement [% of stroke].  A straight line bridges a few
+        wild readings.
 
         Parameters
         ----------

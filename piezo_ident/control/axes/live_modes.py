@@ -72,17 +72,12 @@ class LiveModesInverse:
 
     Attributes
     ----------
-    preview, passes : int
-        Samples ahead, and number of passes that share them.
-    error : float
-        Error through the finite preview and number of passes, of the worst axis [%].  It is 100
-        rms(wanted - reached) / (max wanted - min wanted) of the modes on a trial motion of two
-        slow sines an axis, over the range.
+    preview, passes, error, warnings
+        As of `LiveInverse`; the error is that of the worst axis on a trial of all axes at once.
     position : ndarray, shape (k,)
         Displacements of the stage at rest [m].
     models : list of StageModel
         Models of the axes beside the modes, with scaling and known errors.
-    warnings : tuple of str
 
     Raises
     ------
