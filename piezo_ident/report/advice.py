@@ -58,11 +58,11 @@ class Prompt:
     reading: tuple[str, ...] = ()
 
     def files(self, names: Iterable[str]) -> list[str]:
-        """Return the files of records."""
+        """Name the files of records."""
         return [self.records.get(name, name) for name in names]
 
     def command(self, verb: str, *words: str, reads: bool = True) -> str:
-        """Return a command line."""
+        """Write a command line."""
         return shlex.join(['piezo_ident', verb, *words, *(self.reading if reads else ())])
 
 
@@ -160,7 +160,7 @@ def _after_diagnosis(result: Diagnosis, prompt: Prompt) -> Iterator[Step]:
 
 
 def _plays(record: Record, name: str) -> bool:
-    """Whether the voltage of a record follows a shipped program, scaled to any range."""
+    """Tell whether the voltage of a record follows a shipped program, scaled to any range."""
     program = Program.load(name)
     return any(_is_played(program, piece) for piece in record)
 
@@ -182,7 +182,7 @@ def _is_played(program: Program, piece: Piece) -> bool:
 
 
 def _means(v: Array, rate: float) -> Array:
-    """Return the means over `COARSE`."""
+    """Average a voltage over stretches of `COARSE`."""
     edges = np.arange(0.0, v.size / rate, COARSE)
     total = np.concatenate([[0.0], np.cumsum(v)]) / rate
     means: Array = np.diff(np.interp(edges, np.arange(v.size + 1) / rate, total)) / COARSE

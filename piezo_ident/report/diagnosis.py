@@ -14,6 +14,7 @@ import numpy as np
 from piezo_ident import __version__
 from piezo_ident.diagnosis.results import (
     Diagnosis,
+    Errors,
     FORMULA,
     FoundEffect,
     FoundParameter,
@@ -52,7 +53,7 @@ FOOTER = (
 
 
 def headline(result: Diagnosis) -> str:
-    """Return the verdict in words, and the errors on records that took no part."""
+    """Tell the errors on records that took no part, and the verdict in words."""
     texts = [
         f'On {x.record}, which took no part, the model as given errs by {number(x.before)} % of '
         f'stroke, the refined one by {number(x.after)} %.'
@@ -61,12 +62,15 @@ def headline(result: Diagnosis) -> str:
     return ' '.join([*texts, result.sentence])
 
 
+def _states(result: Diagnosis) -> list[tuple[str, Errors]]:
+    """List the errors to compare; a refined model that refits H alone is the refitted one."""
+    states = zip(STATES, (result.before, result.refit, result.after), strict=True)
+    return [*states][:: 2 if result.verdict == 'refitted' else 1]
+
+
 def error_table(result: Diagnosis) -> Table:
-    """Return the errors before and after: overall, by segment and by frequency of a sine."""
-    states, names = [result.before, result.refit, result.after], [*STATES]
-    if result.verdict == 'refitted':
-        # the refined model is the same with H refitted
-        del states[1], names[1]
+    """List the errors before and after: overall, by segment and by frequency of a sine."""
+    names, states = zip(*_states(result), strict=True)
 
     def row(name: str, values: list[float]) -> tuple[str, ...]:
         ratio = values[0] / values[-1] if values[-1] > 0.0 else math.nan
@@ -92,7 +96,7 @@ def error_table(result: Diagnosis) -> Table:
 
 
 def unseen_tables(result: Diagnosis) -> list[Table]:
-    """Return the errors on records that took no part, if there are any."""
+    """List the errors on records that took no part, if there are any."""
     rows: list[tuple[str, ...]] = []
     for x in result.unseen:
         errors = (x.before, x.after, x.before_centred, x.after_centred)
@@ -111,7 +115,7 @@ def unseen_tables(result: Diagnosis) -> list[Table]:
 
 
 def parameter_rows(result: Diagnosis) -> list[tuple[str, ...]]:
-    """Return effect, parameter, value with its uncertainty, unit and meaning."""
+    """List effect, parameter, value with its uncertainty, unit and meaning."""
     rows: list[tuple[str, ...]] = []
     for effect in result.effects:
         meaning = {p.name: p.description for p in find_effect(effect.name).parameters}
@@ -123,7 +127,7 @@ def parameter_rows(result: Diagnosis) -> list[tuple[str, ...]]:
 
 
 def value_text(parameter: FoundParameter) -> str:
-    """Return a value, or a list of them, with the uncertainty of each."""
+    """Format a value, or a list of them, with the uncertainty of each."""
     if isinstance(parameter.value, str):
         return parameter.value
     values = np.atleast_1d(np.asarray(parameter.value, dtype=np.float64)).tolist()
@@ -158,14 +162,11 @@ def _parameter_tables(result: Diagnosis) -> list[Table]:
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
-    """Return the few numbers that stand beside the verdict."""
-    errors = zip(STATES, (result.before, result.refit, result.after), strict=True)
-    if result.verdict == 'refitted':
-        errors = zip(STATES[::2], (result.before, result.after), strict=True)
+    """List the few numbers that stand beside the verdict."""
     return [
         ('verdict', result.verdict.replace('_', ' ')),
         ('model', ', '.join(result.changes) or 'stays as given'),
-        *((name, f'{number(e.overall)} % of stroke') for name, e in errors),
+        *((name, f'{number(e.overall)} % of stroke') for name, e in _states(result)),
         *(('another record', p.told) for p in [result.promise] if p and not result.unseen),
         ('added', ', '.join(e.name for e in result.effects) or 'nothing'),
         ('unexplained', f'{number(result.unexplained.rms_percent)} % of stroke'),
@@ -173,7 +174,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
 
 
 def remains(result: Diagnosis) -> list[tuple[str, str]]:
-    """Return rows on the remaining error, its validity, H, noise, and the detectable size."""
+    """List the remaining error, its validity, H, noise, and the detectable size."""
     left, smallest, floor = result.unexplained, result.smallest_detectable, result.noise_floor
     source = result.noise_source.removeprefix(UNKNOWN)
     rest = f': {left.description}' if left.description else ''
@@ -181,7 +182,7 @@ def remains(result: Diagnosis) -> list[tuple[str, str]]:
     size = f'{number(left.rms_percent)} % of stroke'
     rows = [
         # a share is known only beside an effect
-        ('unexplained', (_left(left) if result.effects else size) + rest),
+        ('unexplained', (_share_and_size(left) if result.effects else size) + rest),
         ('error holds', _stands_for(result)),
         *(('hysteresis', text) for text in law_told(result)),
         ('noise floor', f'{noise} ({source})'),
@@ -199,14 +200,14 @@ def _stands_for(result: Diagnosis) -> str:
     return f'for motion of these kinds, each predicted from the others: {kinds}'
 
 
-def _left(part: FoundEffect | Unexplained) -> str:
+def _share_and_size(part: FoundEffect | Unexplained) -> str:
     return (
         f'{share_text(part.share)} of the explainable part, {number(part.rms_percent)} % of stroke'
     )
 
 
 def _added(result: Diagnosis) -> list[str]:
-    return [f'added: {x.name} (slot: {x.slot}), {_left(x)}' for x in result.effects]
+    return [f'added: {x.name} (slot: {x.slot}), {_share_and_size(x)}' for x in result.effects]
 
 
 def _alike(result: Diagnosis) -> list[str]:
@@ -253,7 +254,7 @@ def diagnosis_page(
     candidates: int | None = None,
 ) -> Page:
     """
-    Return the page.
+    Make the page.
 
     `left_out` holds titles of missing pictures, with reasons; `candidates` limits their table.
     """
@@ -303,13 +304,13 @@ def diagnosis_page(
 
 
 def diagnosis_text(result: Diagnosis | EachAxis[Diagnosis]) -> str:
-    """Return verdict, errors before and after, and the effects tried, for a terminal."""
+    """Write verdict, errors before and after, and the effects tried, for a terminal."""
     if isinstance(result, EachAxis):
         return result.told(diagnosis_text)
     return page_text(diagnosis_page(result, candidates=CANDIDATES), result.warnings)
 
 
 def brief_table(result: Diagnosis) -> Table:
-    """Return the facts for a notebook."""
+    """List facts and warnings for a notebook."""
     warnings = [('warning', warning) for warning in result.warnings]
     return Table('Diagnosis', ('', ''), [*facts(result), *remains(result)[1:], *warnings])

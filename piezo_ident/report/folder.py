@@ -98,10 +98,7 @@ def write_report(
         return _of_axes(result, Path(folder), progress, prompt)
     expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
     kind = type(result)
-    if isinstance(result, Diagnosis):
-        data, content, shown = _diagnosis(result, progress)
-    else:
-        data, content, shown = _identified(result, progress)
+    data, content, shown = _content(result, progress)
     progress('writing', 0.9)
     target = Path(folder)
     named = prompt or Prompt(model=str(target / MODEL))
@@ -134,26 +131,26 @@ def _of_axes(
     return pages[0]
 
 
-def _identified(
-    result: Identification, progress: Progress
-) -> tuple[dict[str, Any], Page, list[Shown]]:
+def _content(result: Result, progress: Progress) -> tuple[dict[str, Any], Page, list[Shown]]:
+    """Make numbers, page and pictures of a result."""
+
+    def tick(share: float) -> None:
+        progress('drawing', 0.45 * share)
+
     # matplotlib takes half a second to import, and most commands draw nothing
+    if isinstance(result, Diagnosis):
+        from piezo_ident.report.figures.diagnosis import draw_diagnosis
+
+        drawn = draw_diagnosis(result, tick)
+        shown = _rendered(drawn, progress)
+        return to_json(result), diagnosis_page(result, shown, drawn.left_out), shown
     from piezo_ident.report.figures.identification import draw_identification
 
     runs = result.runs
-    drawn = draw_identification(result, runs, lambda x: progress('drawing', 0.45 * x))
+    drawn = draw_identification(result, runs, tick)
     shown = _rendered(drawn, progress)
     page = identification_page(result, sines_of(runs), shown, drawn.left_out)
     return to_json(result, runs), page, shown
-
-
-def _diagnosis(result: Diagnosis, progress: Progress) -> tuple[dict[str, Any], Page, list[Shown]]:
-    from piezo_ident.report.figures.diagnosis import draw_diagnosis
-
-    drawn = draw_diagnosis(result, lambda x: progress('drawing', 0.45 * x))
-    shown = _rendered(drawn, progress)
-    page = diagnosis_page(result, shown, drawn.left_out)
-    return to_json(result), page, shown
 
 
 def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:
@@ -170,11 +167,7 @@ def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:
     """
     Refuse a folder in which `write_report` would replace a file from another source.
 
-    `kind` is the class of the result.
-
-    Raises
-    ------
-    DataError
+    `kind` is the class of the result; the refusal is a DataError.
     """
     target = Path(folder)
     if (target / NUMBERS[kind]).exists():

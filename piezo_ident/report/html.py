@@ -16,8 +16,8 @@ from piezo_ident.report.table import plain_text, Table
 if TYPE_CHECKING:
     import jinja2
 
-#: size of a pixel of a picture on the screen: letters of picture and page then have one size
-SHOWN = 0.72
+#: pixels of the page for one of a picture: letters of picture and page then have one size
+PIXEL = 0.72
 #: smallest width of a picture on a narrow screen, as a share of its width; then the page scrolls
 LEAST = 0.65
 
@@ -39,7 +39,7 @@ class Shown:
     @property
     def width(self) -> int:
         """Width on the screen; bytes 16 to 19 of a PNG hold its width in pixels."""
-        return round(SHOWN * int.from_bytes(self.png[16:20], 'big'))
+        return round(PIXEL * int.from_bytes(self.png[16:20], 'big'))
 
     @property
     def least_width(self) -> int:
@@ -97,7 +97,7 @@ class Page:
 
 
 def page_text(page: Page, warnings: Iterable[str]) -> str:
-    """Return headline, facts, brief sections, boxes and warnings of a page for a terminal."""
+    """Write headline, facts, brief sections, boxes and warnings of a page for a terminal."""
     brief = [part for section in page.sections if section.brief for part in section.parts]
     boxes = [box for box in page.before if box.kind != 'warnings']
     return plain_text(
@@ -112,12 +112,12 @@ def page_text(page: Page, warnings: Iterable[str]) -> str:
 
 
 def named(pictures: Sequence[Shown], *names: str) -> list[Shown]:
-    """Return the pictures whose names begin with one of `names`."""
+    """Choose the pictures whose names begin with one of `names`."""
     return [picture for picture in pictures if picture.name.startswith(names)]
 
 
 def pairs(items: Iterable[tuple[str, str]]) -> list[str]:
-    """Return the items of a box from names and reasons."""
+    """Join names and reasons to the items of a box."""
     return [f'{name}: {reason}' for name, reason in items]
 
 
@@ -136,11 +136,11 @@ def _environment() -> jinja2.Environment:
 
 
 def page_html(page: Page) -> str:
-    """Return a page as one HTML file."""
+    """Write a page as one HTML file."""
     return _environment().get_template('page.html').render(page=page)
 
 
 def summary_html(headline: str, table: Table, picture: Shown) -> str:
-    """Return a sentence, a table and a picture as HTML for a notebook."""
+    """Write a sentence, a table and a picture as HTML for a notebook."""
     template = _environment().get_template('summary.html')
     return template.render(headline=headline, table=table, picture=picture)

@@ -61,7 +61,7 @@ def headline(result: Identification) -> str:
 
 
 def facts(result: Identification) -> list[tuple[str, str]]:
-    """Return the main numbers, for a place beside the headline."""
+    """List the main numbers, for a place beside the headline."""
     model, delay, floor = result.model, result.delay, result.noise_floor
     # slow poles are removed after the search for the order
     na, nb = model.dynamics.a.size, model.dynamics.b.size
@@ -113,7 +113,7 @@ def _stands_for(result: Identification) -> str:
 
 
 def error_table(result: Identification) -> Table:
-    """Return the errors by segment."""
+    """List the errors by record, segment and kind of data."""
     rows = sorted(result.errors, key=lambda row: (KINDS.index(row.data), not row.driven))
     cells = [
         (
@@ -144,7 +144,7 @@ def _fit(row: ErrorRow) -> str:
 
 
 def sine_tables(rows: Sequence[SineError]) -> list[Table]:
-    """Return the steady-state errors in the layout of the paper's Table I; empty without sines."""
+    """List the steady-state errors in the layout of the paper's Table I; empty without sines."""
     errors = [
         ('model with dynamics', *(number(row.percent) for row in rows)),
         ('hysteresis alone', *(number(row.static_percent) for row in rows)),
@@ -159,7 +159,7 @@ def sine_tables(rows: Sequence[SineError]) -> list[Table]:
 
 
 def dynamics_tables(result: Identification) -> list[Table]:
-    """Return delay, coefficients, modes and the methods that were compared."""
+    """List delay, coefficients and modes of G, and the methods that were compared."""
     model, dynamics, delay = result.model, result.dynamics, result.delay
     G = model.dynamics
     na, nb = G.a.size, G.b.size
@@ -221,7 +221,7 @@ def dynamics_tables(result: Identification) -> list[Table]:
 
 
 def hysteresis_tables(result: Identification) -> list[Table]:
-    """Return the weights and the losses of both solvers."""
+    """List the weights of H, the losses of their solvers, and the laws of H that were compared."""
     model, fit = result.model, result.hysteresis
     h, s, m = model.hysteresis, model.scaling, model.hysteresis.thresholds.size
     std = fit.std if fit.std.size == m + 2 else np.full(m + 2, math.nan)
@@ -247,11 +247,8 @@ def hysteresis_tables(result: Identification) -> list[Table]:
         laws,
         'Geometric mean over parts of the data, each predicted from the other parts. A wider law '
         'than plays must err by a quarter less.'
-        + (
-            ''
-            if fit.law == 'plays'
-            else ' The weights above are then those at the lowest voltage.'
-        ),
+        + ' The weights above are then those at the lowest voltage.'
+        * (fit.law != 'plays'),
     )
     solvers = [('bounded least squares (optimum)', number(fit.optimum_loss, 5), '', '')]
     if fit.swarm_loss is not None and fit.swarm is not None:
@@ -285,7 +282,7 @@ def identification_page(
     pictures: Sequence[Shown] = (),
     left_out: Sequence[tuple[str, str]] = (),
 ) -> Page:
-    """Return the page; `left_out` holds titles of missing pictures, with reasons."""
+    """Make the page; `left_out` holds titles of missing pictures, with reasons."""
     faults = [
         (record.name, fault.name, str(fault.count), fault.where, fault.action)
         for record in result.records
@@ -338,14 +335,14 @@ def identification_page(
 
 
 def identification_text(result: Identification | EachAxis[Identification]) -> str:
-    """Return headline, facts, errors and warnings for a terminal."""
+    """Write headline, facts, errors and warnings for a terminal."""
     if isinstance(result, EachAxis):
         return result.told(identification_text)
     return page_text(identification_page(result), result.warnings)
 
 
 def brief_table(result: Identification) -> Table:
-    """Return facts and errors for a notebook."""
+    """List facts, errors and warnings for a notebook."""
     rows = [(kind, number(result.error(kind))) for kind in KINDS]
     errors = [(f'error, {kind}', f'{x} % of stroke') for kind, x in rows if x != '–']
     warnings = [('warning', warning) for warning in result.warnings]
@@ -353,6 +350,6 @@ def brief_table(result: Identification) -> Table:
 
 
 def table_one(rows: Sequence[SineError]) -> str:
-    """Return the errors of sines as a table for a terminal, one column a frequency."""
+    """Write the errors of sines as a table for a terminal, one column a frequency."""
     tables = sine_tables(rows)
     return plain_text(tables or ['no sine segment is long enough for its steady state'])

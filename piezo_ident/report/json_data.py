@@ -39,10 +39,7 @@ VERSION = {'schema_version': 1, 'package_version': __version__}
 DIAGNOSIS_VERSION = 2
 
 
-def to_json(
-    result: Shown,
-    runs: Sequence[PieceRun] = (),
-) -> dict[str, Any]:
+def to_json(result: Shown, runs: Sequence[PieceRun] = ()) -> dict[str, Any]:
     """
     Convert a result to plain data, ready for strict JSON.
 
@@ -57,8 +54,9 @@ def to_json(
     -------
     dict
         Numbers in SI units, errors in % of stroke, shares within 0 .. 1.  Unknown and infinite
-        numbers are None, with two exceptions.  An infinite parameter of an effect is the text
-        ``inf`` or ``-inf``.  The overall error of a diverged model is the largest float64.
+        numbers are None, with these exceptions.  An infinite parameter of an effect is the text
+        ``inf`` or ``-inf``.  An unknown share or rms of a diagnosis is 0.  The overall error of a
+        diverged model is the largest float64.
     """
     if isinstance(result, EachAxis):
         return {**VERSION, 'axes': {axis: to_json(x) for axis, x in result.items()}}
@@ -133,12 +131,12 @@ def _free_run_errors(errors: FreeRunErrors) -> dict[str, Any]:
 
 
 def json_text(result: Shown, runs: Sequence[PieceRun] = ()) -> str:
-    """Return `to_json` as text on one line."""
+    """Write `to_json` as text on one line."""
     return json.dumps(to_json(result, runs), ensure_ascii=False, allow_nan=False)
 
 
 def diagnosis_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a diagnosis, as plain data."""
+    """Read the JSON Schema of a diagnosis, as plain data."""
     file = resources.files('piezo_ident').joinpath('schemas', 'diagnosis.schema.json')
     schema: dict[str, Any] = json.loads(file.read_text(encoding='utf-8'))
     return schema
@@ -146,7 +144,7 @@ def diagnosis_schema() -> dict[str, Any]:
 
 def steps_to_json(steps: Steps, sample_rate: float, records: Sequence[Record]) -> dict[str, Any]:
     """
-    Return the result of single steps, under the keys of `to_json`.
+    Convert the result of single steps to plain data, under the keys of `to_json`.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> N
 
     Parameters
     ----------
-    result : Identification, Diagnosis, FreeRun or Inverse
+    result : Identification, Diagnosis, FreeRun, Inverse or Record, or EachAxis of them
     path : path
         Ending in .png, .pdf or .svg; an old file is replaced.  With several axes, each axis has
         its own file, with the name of the axis at the end.
@@ -110,12 +110,12 @@ def save_plot(result: Result | EachAxis[Any], path: str | os.PathLike[str]) -> N
 
 
 def to_text(result: Result) -> str:
-    """Return headline and table of a result as text, for a prompt."""
+    """Write headline and table of a result as text, for a prompt."""
     return plain_text(_summary(result))
 
 
 def to_html(result: Result) -> str:
-    """Return headline, table and picture of a result as HTML, for a notebook."""
+    """Write headline, table and picture of a result as HTML, for a notebook."""
     from piezo_ident.report.figures.style import png
 
     headline, table = _summary(result)

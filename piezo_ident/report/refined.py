@@ -23,7 +23,7 @@ def validated(
     result: Diagnosis | EachAxis[Diagnosis], records: Sequence[Record]
 ) -> Diagnosis | EachAxis[Diagnosis]:
     """
-    Return a diagnosis with the errors of both models on records that took no part in it.
+    Add to a diagnosis the errors of both models on records that took no part in it.
 
     Raises
     ------

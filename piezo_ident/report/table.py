@@ -51,7 +51,7 @@ class Table:
         )
 
     def lines(self) -> list[str]:
-        """Return the table for a terminal; a last column of text is wrapped."""
+        """Write the table for a terminal; a last column of text is wrapped."""
         rows = [self.head, *self.rows] if any(self.head) else list(self.rows)
         cells = [[printable(cell) for cell in row] for row in rows]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -72,13 +72,13 @@ class Table:
 def table(
     title: str, head: tuple[str, ...], rows: Sequence[tuple[str, ...]], note: str = ''
 ) -> list[Table]:
-    """Return a list with the table; empty if `rows` is empty."""
+    """Make a list with one table, or an empty list if `rows` is empty."""
     return [Table(title, head, rows, note)] if rows else []
 
 
 def listed(names: Iterable[str]) -> str:
     """
-    Return names on one line, the first of many and how many more there are.
+    Join names on one line, the first of many and how many more there are.
 
     >>> listed('abcdefghijk')
     'a, b, c, d, e, f, g, h and 3 more'
@@ -89,7 +89,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def plain_text(parts: Iterable[Table | str]) -> str:
-    """Return tables and paragraphs for a terminal; empty paragraphs are left out."""
+    """Write tables and paragraphs for a terminal; empty paragraphs are left out."""
     blocks = (
         part.lines() if isinstance(part, Table) else _wrapped(printable(part), '')
         for part in parts
@@ -127,7 +127,7 @@ def share_text(share: float) -> str:
 def origin_tables(
     settings: Mapping[str, object], unset: str, versions: Mapping[str, object]
 ) -> list[Table]:
-    """Return the settings and versions of a result; `unset` stands for a setting of None."""
+    """List the settings and versions of a result; `unset` stands for a setting of None."""
 
     def text(value: object) -> str:
         if isinstance(value, tuple):

@@ -32,6 +32,8 @@ LEAST_RANGE = 4.0
 #: largest damping ratio and relative uncertainty of a mode that is named in a response, and
 #: smallest distance of two names as a share of the width
 DAMPED, UNSURE, APART = 0.5, 0.1, 0.09
+#: line of a delay that was found but is not used
+UNUSED: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
 
 
 def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Figure:
@@ -56,7 +58,7 @@ def delay_figure(identification: Identification, runs: Sequence[PieceRun]) -> Fi
 
 
 def _model_step(step: StepDelay, runs: Sequence[PieceRun]) -> Array | None:
-    """Return the model's averaged response to the same steps, if they are all there."""
+    """Average the response of the model to the same steps, if they are all there."""
     before, after = -int(step.lag[0]), int(step.lag[-1]) + 1
     for labelled in (True, False):
         pieces = []
@@ -87,8 +89,7 @@ def _draw_step(
     axes.axhspan(floor, level, label='noise threshold', **band)
     axes.axvline(d, color=COLOURS['mark'], linewidth=1.3, zorder=2, label=f'used: {d}')
     if step.samples not in (None, d):
-        dashed: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
-        axes.axvline(step.samples, label=f'steps: {step.samples}', **dashed)
+        axes.axvline(step.samples, label=f'steps: {step.samples}', **UNUSED)
     if modelled is not None:
         y_hat = np.maximum(1e9 * np.abs(modelled[near]), floor)
         axes.plot(lag, y_hat, color=COLOURS['model'], linewidth=1.2, label='model')
@@ -116,8 +117,7 @@ def _draw_scan(axes: Axes, loss: Array, scan: int | None, chosen: int) -> None:
     axes.semilogy(d, loss / loss.min(), 'o-', color=COLOURS['measured'], markersize=3, linewidth=1)
     axes.axvline(chosen, color=COLOURS['mark'], linewidth=1.4, label=f'used: {chosen}')
     if scan is not None and scan != chosen:
-        dashed: dict[str, Any] = {'color': COLOURS['static'], 'linestyle': '--', 'linewidth': 1.2}
-        axes.axvline(scan, label=f'scan: {scan}', **dashed)
+        axes.axvline(scan, label=f'scan: {scan}', **UNUSED)
     tidy(axes, 'delay tried / samples', 'ARX loss / smallest', 'scan of the ARX loss')
     style.plain_log(axes.yaxis, 1.0, float(loss.max() / loss.min()) + 1.0)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

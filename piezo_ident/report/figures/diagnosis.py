@@ -88,7 +88,7 @@ def draw_diagnosis(
 
 
 def worst_pieces(diagnosis: Diagnosis, most: int = TRACES) -> list[Residual]:
-    """Return the pieces that the model misses most, in the order in which they were measured."""
+    """Choose the pieces that the model misses most, in the order in which they were measured."""
     missed = [-float(np.sum(r.before[r.sound] ** 2)) for r in diagnosis.residuals]
     return [diagnosis.residuals[i] for i in sorted(np.argsort(missed, kind='stable')[:most])]
 
@@ -114,14 +114,14 @@ def _analyses(diagnosis: Diagnosis) -> tuple[ResidualAnalysis, ResidualAnalysis 
 
 
 def _is_refit(diagnosis: Diagnosis) -> bool:
-    """Whether the refined model differs from the given model by its H alone."""
+    """Tell whether the refined model differs from the given model by its H alone."""
     return not differ(diagnosis.residuals) and not all(
         np.array_equal(r.given, r.after) for r in diagnosis.residuals
     )
 
 
 def _states(diagnosis: Diagnosis) -> list[tuple[Errors, str, str]]:
-    """Return the errors that are compared, with their names and colours."""
+    """List the errors that are compared, with their names and colours."""
     errors = (diagnosis.before, diagnosis.refit, diagnosis.after)
     if _is_refit(diagnosis):
         # of the refit, the error on kinds of motion that were held out

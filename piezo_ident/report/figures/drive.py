@@ -33,8 +33,8 @@ def drive_figure(drive: Inverse) -> Figure:
         error.axhspan(-scale * band, scale * band, color=COLOURS['band'], alpha=0.6, label=label)
     style.line(error, t, scale * e, COLOURS['model'], 'left by the inversion', linewidth=0.8)
     style.symmetric(error, scale * max(limit, 1.3 * band))
-    if largest > max(limit, 1.3 * band):
-        style.note(error, f'axis cut; largest {scale * largest:.3g} {unit}')
+    if cut := style.cut_text(largest, max(limit, 1.3 * band), unit, scale):
+        style.note(error, cut)
     # where a limit holds the voltage
     for k, (first, stop) in enumerate(true_runs(drive.clipped)):
         for axes in volts, motion:

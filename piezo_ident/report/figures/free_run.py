@@ -48,8 +48,8 @@ def loops_figure(runs: Sequence[PieceRun]) -> Figure:
     _loop(loops, v, 1e6 * y_hat, COLOURS['model'], 'model')
     _loop(errors, v, scale * (y - y_hat), COLOURS['model'], width=0.6)
     style.symmetric(errors, scale * limit)
-    if largest > limit:
-        style.note(errors, f'axis cut; largest {scale * largest:.3g} {unit}')
+    if cut := style.cut_text(largest, limit, unit, scale):
+        style.note(errors, cut)
     name = ', '.join(filter(None, (style.safe(run.record), style.safe(s.label))))
     tidy(loops, '', 'displacement / µm', name)
     tidy(errors, 'voltage / V', f'error / {unit}')
@@ -85,7 +85,7 @@ def _draw_error(
     """Draw errors [m], with the hysteresis alone if both are readable; return the unit."""
     limit, largest = style.axis_limit(e)
     unit, scale = style.length_unit(largest)
-    remarks = [f'axis cut; largest {scale * largest:.3g} {unit}'] if largest > limit else []
+    remarks = [style.cut_text(largest, limit, unit, scale)] if largest > limit else []
     if not np.array_equal(e, e_static, equal_nan=True):
         static_limit, static_largest = style.axis_limit(e_static)
         if static_limit <= READABLE * limit:
@@ -204,7 +204,7 @@ def segments_figure(runs: Sequence[PieceRun], errors: Mapping[tuple[str, str], s
 
 
 def _readable(run: PieceRun, s: Segment) -> tuple[slice, str]:
-    """Choose the readable part of a segment for a small picture; the part and its name."""
+    """Choose the readable part of a segment for a small picture; return the part and its name."""
     frequency = sine_frequency(s.label)
     if frequency is not None:
         period = run.piece.sample_rate / frequency

@@ -70,9 +70,7 @@ def draw_identification(
             ),
             lambda: segments_figure(runs, errors),
         ),
-    ]
-    wanted += _overviews(runs, refitted)
-    wanted += [
+        *_overviews(runs, refitted),
         (
             'delay',
             'Delay',
@@ -96,7 +94,7 @@ def draw_identification(
 
 
 def _overviews(runs: Sequence[PieceRun], refitted: Mapping[str, float]) -> list[Wanted]:
-    """Return the pictures of the widest records as a whole."""
+    """List the pictures of the widest records as a whole."""
     wanted: list[Wanted] = []
     by_width = sorted(range(len(runs)), key=lambda i: -float(np.ptp(runs[i].piece.v)))
     for k, i in enumerate(sorted(by_width[:OVERVIEWS]), 1):
@@ -141,7 +139,7 @@ def _of_response(dynamics: DynamicsResult) -> str:
 
 
 def _refitted(identification: Identification) -> dict[str, float]:
-    """Return the held-out error of each record to which H was fitted as a whole later."""
+    """Find the held-out error of each record to which H was fitted as a whole later."""
     # a table of orders comes with segments
     if identification.dynamics.table is not None or identification.shared is not None:
         return {}

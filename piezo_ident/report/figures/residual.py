@@ -44,7 +44,7 @@ AXES = {
 
 
 def differ(residuals: Sequence[Residual]) -> bool:
-    """Whether the refined model differs from the given model by more than a refitted H."""
+    """Tell whether the refined model differs from the given model by more than a refitted H."""
     return not any(
         all(np.array_equal(getattr(r, name), r.after) for r in residuals)
         for name in ('given', 'before')
@@ -80,7 +80,7 @@ def residual_figure(residual: Residual) -> Figure:
     for ax, (names, end, remark) in zip(axes[1:], rows, strict=True):
         unit, scale = style.length_unit(end)
         largest = max(float(np.abs(e[name]).max()) for name in names)
-        cut = f'axis cut; largest {scale * largest:.3g} {unit}' if largest > end else ''
+        cut = style.cut_text(largest, end, unit, scale)
         for name, label, colour in STATES:
             if name in names:
                 _trace(ax, residual, name, scale, colour, label)
@@ -130,7 +130,7 @@ def _both(
 
 
 def _density(part: ResidualPart) -> tuple[Array, Array]:
-    """Return frequency [Hz] and amplitude density [m/sqrt(Hz)] of the longest sound stretch."""
+    """Compute frequency [Hz] and amplitude density [m/sqrt(Hz)] of the longest sound stretch."""
     start, stop = max(part.runs(), key=lambda r: r[1] - r[0])
     n = min(stop - start, LONGEST)
     f, power = signal.welch(

@@ -92,7 +92,7 @@ def draw_each(wanted: Sequence[Wanted], tick: Callable[[float], None]) -> Drawn:
 
 
 def png(picture: Figure, dpi: int | None = None) -> bytes:
-    """Return a figure as PNG."""
+    """Render a figure as PNG."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format='png', dpi=dpi or DPI)
     return buffer.getvalue()
@@ -107,7 +107,7 @@ def safe(text: str, longest: int = 60) -> str:
 
 
 def figure(height: float, width: float = WIDTH) -> Figure:
-    """Return an empty white figure [inch] that keeps its labels apart."""
+    """Make an empty white figure [inch] that keeps its labels apart."""
     return Figure(figsize=(width, height), layout='constrained', facecolor='white')
 
 
@@ -134,18 +134,23 @@ def legend(axes: Axes, **options: Any) -> None:
 
 
 def length_unit(largest: float) -> tuple[str, float]:
-    """Return the unit in which lengths up to `largest` [m] read best, and its factor."""
+    """Choose the unit in which lengths up to `largest` [m] read best, and its factor."""
     if largest >= 1e-6:
         return 'µm', 1e6
     return ('nm', 1e9) if largest >= 1e-9 else ('pm', 1e12)
 
 
 def axis_limit(errors: Array) -> tuple[float, float]:
-    """Return where to end an axis for some errors, and the largest; rare spikes are cut."""
+    """Choose the end of an axis of errors, which cuts rare spikes; return it and the largest."""
     sizes = np.abs(errors[~np.isnan(errors)])
     largest = float(sizes.max(initial=0.0))
     usual = ROOM * float(np.quantile(sizes, USUAL)) if sizes.size else 0.0
     return (usual if 0.0 < FAR * usual < largest else largest), largest
+
+
+def cut_text(largest: float, limit: float, unit: str, scale: float) -> str:
+    """Say that an axis is cut at `limit`, and the largest error; empty if nothing is cut."""
+    return f'axis cut; largest {scale * largest:.3g} {unit}' if largest > limit else ''
 
 
 def symmetric(axes: Axes, limit: float) -> None:
@@ -157,7 +162,7 @@ def symmetric(axes: Axes, limit: float) -> None:
 
 def envelope(y: Array, points: int = POINTS) -> Integers:
     """
-    Return the samples that show every extreme of a trace: about `points`, or all of a short one.
+    Choose the samples that show every extreme of a trace: about `points`, or all of a short one.
 
     A long trace keeps the smallest and the largest sample of each stretch.  A stretch of NaN keeps
     a NaN, which breaks the line.
@@ -209,7 +214,6 @@ def percent_axis(axes: Axes, stroke: float) -> None:
     """Add a right-hand axis in % of stroke; `stroke` in the unit of the left one."""
     if stroke <= 0.0:
         return
-
     both = (lambda e: 100.0 * e / stroke, lambda p: p * stroke / 100.0)
     right = axes.secondary_yaxis('right', functions=both)
     right.set_ylabel('% of stroke', fontsize=NORMAL)
