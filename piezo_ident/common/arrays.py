@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Types of arrays, arrays that cannot be changed, and a range that wild numbers do not widen."""
+"""Arrays: types, checks, runs of true values, straight lines, a range without wild numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CURES = {
 
 
 def frozen_array(values: ArrayLike, where: str = 'array') -> Array:
-    """Return `values` as a read-only `real_array`, copied only when it must be."""
+    """Convert `values` to a read-only `real_array`, copied only when it must be."""
     array = real_array(values, where)
     if array.flags.writeable:
         # a view would leave the data open to its owner, so only already frozen arrays are shared
@@ -42,7 +42,7 @@ def frozen_array(values: ArrayLike, where: str = 'array') -> Array:
 
 def real_array(values: ArrayLike, where: str = 'array') -> Array:
     """
-    Return real numbers as float64, with NaN for a masked one; DataError names what is no number.
+    Convert real numbers to float64, a masked one to NaN; DataError names what is no number.
 
     >>> real_array(np.ma.array([1, 2, 3], mask=[False, True, False]))
     array([ 1., nan,  3.])
@@ -64,14 +64,14 @@ def real_array(values: ArrayLike, where: str = 'array') -> Array:
 
 
 def true_runs(mask: Mask) -> list[tuple[int, int]]:
-    """Return the runs of true values, as first and behind the last."""
+    """List the runs of true values, each as its first place and the place behind its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def closed(mask: Mask, most: int) -> Mask:
     """
-    Return a mask that goes on over up to `most` samples between two stretches of true ones.
+    Close the gaps of up to `most` samples between two stretches of true ones.
 
     >>> closed(np.array([False, True, False, True, False, False, True]), 1).astype(int)
     array([0, 1, 1, 1, 0, 0, 1])
@@ -84,7 +84,7 @@ def closed(mask: Mask, most: int) -> Mask:
 
 def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
     """
-    Return numbers with straight lines between usable good ones in place of the bad ones.
+    Replace bad numbers by straight lines between usable good ones.
 
     The same array comes back if all numbers are good, or all are bad.
 
@@ -101,7 +101,7 @@ def interpolated(x: Array, bad: Mask, usable: Mask | None = None) -> Array:
 
 def line_between(before: float, after: float, missing: int) -> Array:
     """
-    Return the missing numbers on the straight line between two numbers.
+    Compute the missing numbers on the straight line between two numbers.
 
     >>> line_between(1.0, 4.0, 2)
     array([2., 3.])
@@ -111,7 +111,7 @@ def line_between(before: float, after: float, missing: int) -> Array:
 
 def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
-    Return the smallest and largest of measured numbers, but for wild ones.
+    Find the smallest and largest of measured numbers, but for wild ones.
 
     Three samples in a row span the range.  One or two samples alone may leave the range by a
     quarter of its width and four times the usual step from sample to sample; wilder samples are

@@ -33,17 +33,17 @@ def _folders() -> Iterator[Path]:
 
 
 def shipped_names(prefix: str = '') -> list[str]:
-    """Return the names, without prefix, of shipped files: ``program_`` or ``stage_``."""
+    """List the names, without prefix, of shipped files: ``program_`` or ``stage_``."""
     found = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
     return sorted(name.removeprefix(prefix) for name in found)
 
 
 def find_config(name: str | os.PathLike[str], kind: str) -> Path:
     """
-    Return the file of a program or a stage, the `kind`, by its name or path.
+    Find the file of a program or a stage, the `kind`, by its name or path.
 
-    ``identification`` is the shipped ``program_identification.yaml``.  A path without a file means
-    the shipped file of the same name.  Otherwise a ConfigError names the shipped files.
+    ``identification`` is the shipped ``program_identification.yaml``, even beside a file of that
+    name.  A path without a file means the shipped one; else a ConfigError names those shipped.
     """
     path = Path(name)
     plain = path.suffix == '' and path.name == str(name)

@@ -18,7 +18,7 @@ _LONGEST = 4000
 
 def printable(text: str) -> str:
     r"""
-    Return a text in one line without control characters, which could steer a terminal.
+    Write a text in one line without control characters, which could steer a terminal.
 
     >>> printable('a\tlabel\x1b[2J')
     'a label?[2J'

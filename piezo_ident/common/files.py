@@ -36,7 +36,7 @@ _MERGE_KEY = re.compile(r'(^|[{,])\s*<<\s*:', re.MULTILINE)
 
 
 def broken_link(path: str | os.PathLike[str]) -> str | None:
-    """Return the fault of a symbolic link that leads nowhere, else None."""
+    """Describe the fault of a symbolic link that leads nowhere; else None."""
     if os.path.islink(path) and not os.path.exists(path):
         return f'is a link to {os.readlink(path)}, which cannot be reached; mend the link'
     return None
@@ -182,7 +182,7 @@ def check_replaceable(folder: Path) -> None:
 
 
 def unwritable(path: Path, error: Exception) -> DataError:
-    """Return the error for a place that the disk refuses."""
+    """Make the error for a place that the disk refuses."""
     reason = getattr(error, 'strerror', None) or str(error)
     return DataError(
         f'{path}: cannot be written ({reason}); choose a folder that exists, with room and the '
@@ -221,7 +221,7 @@ def _put_in_place(new: Path, target: Path, replaced: Path) -> None:
         except BaseException:
             replaced.rename(target)
             raise
-    # not every file system knows it
+    # not every file system can bring the names in a folder to disk
     with suppress(OSError):
         _sync(target.parent)
 

@@ -35,7 +35,7 @@ def kernel(function: F) -> F:
 
 
 def ordered_kernel(function: F) -> F:
-    """Compile a function whose sums keep their order: lanes side by side, or equal loops."""
+    """Compile a function whose sums keep their order, so that equal loops give the same bits."""
     return _compiled(function)
 
 
@@ -86,7 +86,7 @@ event.register('numba:compile', _NOTICE)  # type: ignore[no-untyped-call]
 @ordered_kernel
 def alive(x: float) -> float:
     """
-    Return x, or zero for an x that has died away.
+    Keep x, or put zero for an x that has died away.
 
     The state of a filter whose input rests falls to subnormal numbers, which take a processor a
     hundred times as long.  This function is compiled into each loop that calls it.  Loops are
