@@ -42,7 +42,7 @@ def frozen_array(values: ArrayLike, where: str = 'array') -> Array:
 
 def real_array(values: ArrayLike, where: str = 'array') -> Array:
     """
-    Convert real numbers to float64, a masked one to NaN; DataError names what is no number.
+    Convert real numbers to float64, a masked number to NaN; raise DataError for other types.
 
     >>> real_array(np.ma.array([1, 2, 3], mask=[False, True, False]))
     array([ 1., nan,  3.])

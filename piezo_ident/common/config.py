@@ -34,8 +34,8 @@ def _folders() -> Iterator[Path]:
 
 def shipped_names(prefix: str = '') -> list[str]:
     """List the names, without prefix, of shipped files: ``program_`` or ``stage_``."""
-    found = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
-    return sorted(name.removeprefix(prefix) for name in found)
+    stems = {path.stem for folder in _folders() for path in folder.glob(f'{prefix}*.yaml')}
+    return sorted(name.removeprefix(prefix) for name in stems)
 
 
 def find_config(name: str | os.PathLike[str], kind: str) -> Path:

@@ -236,7 +236,7 @@ def _sync(path: Path) -> None:
 
 
 def _exchanged(new: Path, old: Path) -> bool:
-    """Swap two folders in one step, so that no moment is without one; False where that fails."""
+    """Swap two folders in one step, so that one is always there; False where that fails."""
     here, exchange = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of Linux
     try:
         swap = ctypes.CDLL(None).renameat2

@@ -72,7 +72,7 @@ class WorkerProcess:
     """
     A process that does one job at a time and is started again when it has died.
 
-    It ends with the process that made it, at any end.  `nice` is its priority below other
+    The process ends with its parent, however the parent ends.  `nice` is its priority below other
     processes, `warm_up` a function of a module that it calls first.
     """
 

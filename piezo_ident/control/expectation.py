@@ -4,10 +4,10 @@
 """
 Predict the error of a stage under the voltage of an inverse.
 
-The error about its mean has three parts, whose squares add up: the known error of the model, the
-part of the motion above the lowest mode that rings, and the drift by creep from earlier motion.
-The known error holds no mean, because a diagnosis fits the zero of each record.  The mean is the
-shift by creep from earlier motion.  A model with creep predicts this shift.
+The error about its mean has three parts: the known error of the model, the part of the motion
+above the lowest mode that rings, and the drift by creep from earlier motion.  Their squares are
+added.  The known error holds no mean, because a diagnosis fits the zero of each record.  The mean
+is the shift by creep from earlier motion.  A model with creep predicts this shift.
 """
 
 from __future__ import annotations

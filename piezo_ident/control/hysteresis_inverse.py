@@ -293,17 +293,17 @@ def rising(hysteresis: Hysteresis, volts: Callable[[float], float] = float) -> H
     """
     low, high = hysteresis.span
     narrow = int(np.sum(hysteresis.thresholds <= NARROW * (high - low)))
-    found, lines = hysteresis, 0
-    while found.lowest_slope() <= 0.0 and lines < narrow:
+    risen, lines = hysteresis, 0
+    while risen.lowest_slope() <= 0.0 and lines < narrow:
         lines += 1
-        found = hysteresis.with_lines(lines)
-    slope, u = found.flattest
+        risen = hysteresis.with_lines(lines)
+    slope, u = risen.flattest
     if not slope > 0.0:
         raise ModelError(
             f'the hysteresis of this model has no inverse: its slope falls to {slope:.2g} at '
             f'{volts(u):.4g} V; identify again from a record with larger sweeps'
         )
-    return found
+    return risen
 
 
 def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ...]]:
@@ -313,12 +313,12 @@ def with_rising_hysteresis(model: StageModel) -> tuple[StageModel, tuple[str, ..
     Raises ModelError if H falls by more than its narrowest plays.
     """
     h = model.hysteresis
-    found = rising(h, model.scaling.v)
-    if found is h:
+    risen = rising(h, model.scaling.v)
+    if risen is h:
         return model, ()
     slope, u = h.flattest
-    widest = float(h.thresholds[found.thresholds != h.thresholds].max()) * model.scaling.V
-    return replace(model, hysteresis=found), (
+    widest = float(h.thresholds[risen.thresholds != h.thresholds].max()) * model.scaling.V
+    return replace(model, hysteresis=risen), (
         f'where the voltage turns, at {model.scaling.v(u):.4g} V, the slope of the hysteresis '
         f'falls to {slope:.2g}: plays of up to {widest:.3g} V are inverted as lines',
     )

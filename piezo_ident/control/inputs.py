@@ -50,9 +50,9 @@ def checked_limits(
 
     Limits of None stand for the identified range.
     """
-    given = model.scaling.range if limits is None else limits
+    ends = model.scaling.range if limits is None else limits
     try:
-        (low, high), speed = map(float, given), float(slew)
+        (low, high), speed = map(float, ends), float(slew)
     except (TypeError, ValueError):
         low = high = speed = np.nan
     if not (-np.inf < low < high < np.inf and speed > 0.0):
@@ -62,14 +62,14 @@ def checked_limits(
 
 def padded(channels: Mapping[str, ArrayLike], n: int, around: tuple[int, int]) -> dict[str, Array]:
     """Extend further signals to the length of the voltage; DataError if a length is wrong."""
-    found = {name: real_array(z, f'invert, channel {name!r}') for name, z in channels.items()}
-    for name, z in found.items():
+    signals = {name: real_array(z, f'invert, channel {name!r}') for name, z in channels.items()}
+    for name, z in signals.items():
         if z.shape != (n,) or not np.all(np.isfinite(z)):
             raise DataError(
                 f'invert: the channel {name!r} must be a vector of {n} finite numbers, one for '
                 'each of the wanted motion'
             )
-    return {name: np.pad(z, around, mode='edge') for name, z in found.items()}
+    return {name: np.pad(z, around, mode='edge') for name, z in signals.items()}
 
 
 def rest_at(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool) -> float:

@@ -80,7 +80,7 @@ class LinearInverse:
         return reach_of(np.abs(self.taps), self.ahead)
 
     def shortened(self, most: int) -> LinearInverse:
-        """Limit the samples ahead to `most`, those behind to what counts; keep the gain."""
+        """Limit the samples ahead to `most`, the past as `past_of` does; keep the static gain."""
         ahead, behind = min(self.ahead, most), past_of(np.abs(self.taps), self.behind)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
         return LinearInverse(taps * (self.taps.sum() / taps.sum()), ahead, behind)

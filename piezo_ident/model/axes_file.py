@@ -56,9 +56,9 @@ def multi_axis_from_dict(data: Mapping[str, Any], name: str) -> MultiAxisModel:
     if wrong := [str(k) for k in axes if k != 'y' and role_of(str(k)) != 'y']:
         raise ModelError(f'{name}: axes {", ".join(wrong)}: an axis is y, or y_ and its name')
     try:
-        found = {str(k): model_from_dict(x, f'{name}: axes.{k}') for k, x in axes.items()}
+        models = {str(k): model_from_dict(x, f'{name}: axes.{k}') for k, x in axes.items()}
         modes = data.get('modes')
-        return MultiAxisModel(found, modes and modes_from_dict(modes, len(found), name))
+        return MultiAxisModel(models, modes and modes_from_dict(modes, len(models), name))
     except ModelError as error:
         raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
 

@@ -29,9 +29,9 @@ the later samples, too.  Their errors over the error of this fit:
 | smoother | within the early part | 0.6 to 1.3 | 1 to 5 |
 
 An offset moves the whole early part, but a play moves it only until the voltage catches the play.
-With the sizes, zeros and correlated error of the observer as its priors, this fit errs 0.02 to 3.4
-times as much (10th and 90th percentile of 36 simulated records): less if the zero has moved, more
-if the stage creeps otherwise than the model.  The priors of this fit are therefore weak.
+The priors of this fit are weak.  With the sizes, zeros and correlated error of the observer as
+priors, the fit errs 0.02 to 3.4 times as much (10th and 90th percentile of 36 simulated records).
+It errs less if the zero has moved, and more if the stage creeps otherwise than the model.
 """
 
 from __future__ import annotations
@@ -232,8 +232,8 @@ def crept(model: StageModel, start: Start) -> float:
 
 def creep_elements(model: StageModel) -> Array:
     """List gains and time constants [s] of the creep of a model, shape (2, c)."""
-    found = [e.parameters for e in model.effects if e.name == Creep.name]
-    return np.array([found[0]['gain'], found[0]['time_constant']]) if found else np.empty((2, 0))
+    creep = [e.parameters for e in model.effects if e.name == Creep.name]
+    return np.array([creep[0]['gain'], creep[0]['time_constant']]) if creep else np.empty((2, 0))
 
 
 def _creeps(model: StageModel) -> bool:
@@ -351,11 +351,11 @@ def _fit(
     # A play that moves at once gives no derivative by its start.  The search therefore begins
     # twice: with plays after a rise of the voltage, and with plays after a fall.
     down = np.minimum(u0, max(u0, h.span[1]) - h.thresholds)
-    found = []
+    fits = []
     for plays in (rest[:m], down) if m else (rest[:m],):
         shares = np.diff(-plays, prepend=-u0) / early.falls
-        found.append(_searched(early, np.concatenate([shares, rest[m:]])))
-    _, state, e = min(found, key=lambda one: one[0])
+        fits.append(_searched(early, np.concatenate([shares, rest[m:]])))
+    _, state, e = min(fits, key=lambda one: one[0])
     return early.start(state), e
 
 

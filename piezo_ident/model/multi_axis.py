@@ -214,12 +214,12 @@ class MultiAxisModel:
 
     def motions(self, record: Record) -> dict[str, list[Array]]:
         """Compute the motion of each axis by its own voltage, an array for each piece [m]."""
-        found = {}
+        motions = {}
         for axis in self.axes:
             seen, own = axis_record(record, axis), self.own(axis)
             known = all(np.isfinite(piece.y).all() for piece in seen)
-            found[axis] = [*(free_run(own, seen).pieces if known else predict(own, seen))]
-        return found
+            motions[axis] = [*(free_run(own, seen).pieces if known else predict(own, seen))]
+        return motions
 
     def seen(self, record: Record) -> dict[str, Record]:
         """Split a record by axis, with the motions of the other axes as channels."""

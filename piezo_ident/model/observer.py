@@ -158,7 +158,7 @@ class Observer:
         Whether the free run begins with known outputs of the plays.  A start at the lowest voltage
         always does.
     gain, drift : bool, optional
-        Whether the gain is followed, too, and whether as one that drifts.
+        Whether the gain is followed, too, and whether as a drifting gain.
     """
 
     def __init__(
@@ -254,7 +254,7 @@ class Observer:
 
     @property
     def doubt(self) -> str:
-        """What the sensor does that the stage hardly does; empty if the sensor seems sound."""
+        """Motion of the sensor that the stage hardly makes; empty if the sensor seems sound."""
         if not self._started:
             return ''
         now = self._state.now

@@ -268,9 +268,9 @@ def diagnosis_page(
         error_table(result),
         *unseen_tables(result),
     ]
-    shown = named(pictures, 'residual', 'signature', 'spectrum', 'coherence')
+    traces = named(pictures, 'residual', 'signature', 'spectrum', 'coherence')
     refined = ', '.join(result.changes) or 'the same as the given model'
-    found: list[str | Table] = [
+    added: list[str | Table] = [
         *_added(result),
         *_parameter_tables(result),
         f'Refined model: {refined}.',
@@ -292,8 +292,8 @@ def diagnosis_page(
         ),
         sections=(
             Section('Error before and after', errors, brief=True),
-            Section('The residual before and after', shown),
-            Section('Effects that were found', found, brief=True),
+            Section('The residual before and after', traces),
+            Section('Effects that were found', added, brief=True),
             Section('Candidates', tried, brief=True),
             Section('Remaining error', remain, brief=True),
             Section('Origin', origin),

@@ -98,7 +98,7 @@ def write_report(
         return _of_axes(result, Path(folder), progress, prompt)
     expect(result, (Identification, Diagnosis), 'write_report', 'give a result')
     kind = type(result)
-    data, content, shown = _content(result, progress)
+    data, content, pictures = _content(result, progress)
     progress('writing', 0.9)
     target = Path(folder)
     named = prompt or Prompt(model=str(target / MODEL))
@@ -108,9 +108,9 @@ def write_report(
     texts = {NUMBERS[kind]: numbers, MODEL: model_to_yaml(result.model)}
     # file names need not be Unicode
     files = {name: text.encode('utf-8', 'replace') for name, text in texts.items()}
-    files |= {f'{picture.name}.png': picture.png for picture in shown}
+    files |= {f'{picture.name}.png': picture.png for picture in pictures}
     write_together(target, {**files, PAGE: page.encode('utf-8', 'replace')})
-    for name in set(PICTURES[kind]) - {picture.name for picture in shown}:
+    for name in set(PICTURES[kind]) - {picture.name for picture in pictures}:
         with suppress(OSError):
             (target / f'{name}.png').unlink()
     return target / PAGE
@@ -142,25 +142,25 @@ def _content(result: Result, progress: Progress) -> tuple[dict[str, Any], Page, 
         from piezo_ident.report.figures.diagnosis import draw_diagnosis
 
         drawn = draw_diagnosis(result, tick)
-        shown = _rendered(drawn, progress)
-        return to_json(result), diagnosis_page(result, shown, drawn.left_out), shown
+        pictures = _rendered(drawn, progress)
+        return to_json(result), diagnosis_page(result, pictures, drawn.left_out), pictures
     from piezo_ident.report.figures.identification import draw_identification
 
     runs = result.runs
     drawn = draw_identification(result, runs, tick)
-    shown = _rendered(drawn, progress)
-    page = identification_page(result, sines_of(runs), shown, drawn.left_out)
-    return to_json(result, runs), page, shown
+    pictures = _rendered(drawn, progress)
+    page = identification_page(result, sines_of(runs), pictures, drawn.left_out)
+    return to_json(result, runs), page, pictures
 
 
 def _rendered(drawn: Drawn, progress: Progress) -> list[Shown]:
     from piezo_ident.report.figures.style import png
 
-    shown = []
+    pictures = []
     for i, picture in enumerate(drawn.pictures):
         progress('drawing', 0.45 + 0.45 * i / len(drawn.pictures))
-        shown.append(Shown(picture.name, picture.title, picture.caption, png(picture.figure)))
-    return shown
+        pictures.append(Shown(picture.name, picture.title, picture.caption, png(picture.figure)))
+    return pictures
 
 
 def check_report_folder(folder: str | os.PathLike[str], kind: type) -> None:

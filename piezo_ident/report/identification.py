@@ -289,8 +289,10 @@ def identification_page(
         for fault in record.faults
     ]
     # a table lists the faults; the same faults among the warnings would hide other warnings
-    shown = {f'{record.name}: {fault}' for record in result.records for fault in record.faults}
-    warnings = [text for text in result.warnings if text not in shown]
+    listed_below = {
+        f'{record.name}: {fault}' for record in result.records for fault in record.faults
+    }
+    warnings = [text for text in result.warnings if text not in listed_below]
     count = sum(not fault.is_note for record in result.records for fault in record.faults)
     if count:
         warnings.append(f'the data had {count} kinds of faults, see below')

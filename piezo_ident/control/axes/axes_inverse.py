@@ -43,7 +43,7 @@ class AxesFilter(NamedTuple):
         return reach_of(_size(self.taps), self.ahead)
 
     def shortened(self, most: int) -> AxesFilter:
-        """Limit the samples ahead to `most`, those behind to what counts; keep the gain."""
+        """Limit the samples ahead to `most`, the past as `past_of` does; keep the static gain."""
         ahead, behind = min(self.ahead, most), past_of(_size(self.taps), self.behind)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
         static = self.taps.sum(axis=0) @ np.linalg.inv(taps.sum(axis=0))

@@ -4,9 +4,9 @@
 """
 Invert the chains of all axes block by block, and make up for the paths between the axes.
 
-The goal of each axis is the wanted motion less what the paths from the other axes add.  The motion
-of the other axes is the wanted one at first, then the goal of the round before, as in
-`piezo_ident.invert`.
+The goal of each axis is its wanted motion minus the motion that the paths from the other axes add.
+The other axes move along their wanted motions in the first round, along the goals of the round
+before in each later round, as in `piezo_ident.invert`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class LiveChains:
         return max(one.error for one in self.each)
 
     def goals(self, wanted: Array) -> Array:
-        """Take what each axis will feel of the others off the wanted motions [m]."""
+        """Subtract the motions that the paths will add from the wanted motions [m]."""
         goals = wanted
         for paths in self._rounds:
             goals = wanted - paths.process(goals)
@@ -93,7 +93,7 @@ class LiveChains:
 
     def moved(self, v: Array, own: Array) -> tuple[Array, Array]:
         """
-        Give the motions under the next voltages that are sent, and what each axis feels [m].
+        Give the motions under the next voltages that are sent, and those added by the paths [m].
 
         `own` are the motions of the chains under these voltages.
         """
@@ -101,7 +101,7 @@ class LiveChains:
 
 
 class LivePaths:
-    """What each axis feels of the motions of the others by their own voltages [m]."""
+    """Motion of each axis that paths add, from the motions of the others by their voltages [m]."""
 
     def __init__(self, model: MultiAxisModel, axes: Sequence[str]) -> None:
         self._model, self._axes = model, tuple(axes)

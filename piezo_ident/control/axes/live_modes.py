@@ -11,8 +11,8 @@ that look ahead, see `axes_inverse`.  As in `piezo_ident.control.live_inverse`, 
 behind the pass before it, and handles every sample once.
 
 The linear model leaves out softening and plays, or it has the gain of each signal in a trial run
-over the range.  The one with the smaller error on the trial is taken.  An axis whose voltage is at
-a limit is left out of the next pass: the others need not move for what it cannot reach.
+over the range.  The linear model with the smaller error on the trial is taken.  The next pass
+leaves out an axis whose voltage is at a limit, because a move of the others does not help it.
 """
 
 from __future__ import annotations

@@ -47,9 +47,10 @@ from scipy.ndimage import maximum_filter1d
 PASSES, STALLS = 40, 6
 #: rms error [of the span of the wanted motion] at which the iteration ends
 EXACT = 1e-5
-#: earlier passes that a step combines (taste: more find nothing in noise of 1e-6), and share of
-#: their largest independent change below which another one does not count
-DEPTH, COUNTS = 8, 1e-8
+#: earlier passes that a step combines (taste: more find nothing in noise of 1e-6)
+DEPTH = 8
+#: smallest singular value of the changes from pass to pass that counts, over the largest (taste)
+COUNTS = 1e-8
 #: most steps to the voltages of rest, and their accuracy [of the span of the model]
 STEPS, AT_REST = 50, 1e-9
 #: the iteration contracts if it leaves at most this share of the error of the linear inverse

@@ -261,17 +261,17 @@ def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
             'creep': (axes, m), 'taus': (m,),
         }  # fmt: skip
         # a list without rows has lost its number of columns
-        found = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
-        sound = all(np.isfinite(x).all() for x in found.values())
-        sound = sound and all((found[x] > 0).all() for x in ('memory', 'taus'))
-        levels, memory = int(found.pop('levels')), float(found.pop('memory'))
-        low, high = map(float, found.pop('range'))
+        arrays = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
+        sound = all(np.isfinite(x).all() for x in arrays.values())
+        sound = sound and all((arrays[x] > 0).all() for x in ('memory', 'taus'))
+        levels, memory = int(arrays.pop('levels')), float(arrays.pop('memory'))
+        low, high = map(float, arrays.pop('range'))
         if not sound or n % 2 or not 0 <= levels <= q or not 0 <= low <= 1 <= high:
             raise ValueError('a number is out of range')
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f'{name}: modes: {error!r}; see docs/two_axes.md') from None
-    linear = Modal(*(found.pop(x.name) for x in fields(Modal)))
-    modes = SharedModes(linear, levels=levels, memory=memory, range=(low, high), **found)
+    linear = Modal(*(arrays.pop(x.name) for x in fields(Modal)))
+    modes = SharedModes(linear, levels=levels, memory=memory, range=(low, high), **arrays)
     if not modes.radius < 1:
         raise ModelError(
             f'{name}: modes: unstable (pole at radius {modes.radius:.6g}); diagnose again'

@@ -24,8 +24,8 @@ class ModesStream:
     ----------
     modes : SharedModes
     side : {-1, 0, 1}, optional
-        Where the plays begin: -1 and 1 are the lower and upper end of all that is possible at
-        rest, 0 is a stage that comes from the middle voltage of the fit.
+        Outputs of the plays at the start.  -1 and 1 are the lower and upper end of all outputs
+        that are possible at rest; 0 is a stage that comes from the middle voltage of the fit.
     """
 
     def __init__(self, modes: SharedModes, side: int = 0) -> None:

@@ -126,9 +126,9 @@ def _states(diagnosis: Diagnosis) -> list[tuple[Errors, str, str]]:
     if _is_refit(diagnosis):
         # of the refit, the error on kinds of motion that were held out
         return [(errors[0], STATES[0][1], STATES[0][2]), (errors[2], STATES[1][1], STATES[1][2])]
-    shown = 3 if differ(diagnosis.residuals) else 2
+    count = 3 if differ(diagnosis.residuals) else 2
     return [
-        (e, name, colour) for e, (_, name, colour) in zip(errors, STATES[:shown], strict=False)
+        (e, name, colour) for e, (_, name, colour) in zip(errors, STATES[:count], strict=False)
     ]
 
 

@@ -153,8 +153,8 @@ def residual_spectrum_figure(
     NothingToDraw when no stretch is long enough for a spectrum.
     """
     i = max(range(len(before.parts)), key=lambda i: before.parts[i].piece.n)
-    shown = before.parts[i]
-    if max((b - a for a, b in shown.runs()), default=0) < 64 or not np.any(shown.e):
+    longest = before.parts[i]
+    if max((b - a for a, b in longest.runs()), default=0) < 64 or not np.any(longest.e):
         raise NothingToDraw('no stretch is long enough for a spectrum')
     fig = style.figure(3.6)
     axes = fig.subplots()
@@ -171,8 +171,8 @@ def residual_spectrum_figure(
         noise = 1e9 * np.sqrt(floor.density[1:-1])
         axes.loglog(floor.frequency[1:-1], noise, 'k--', linewidth=1.0, label='noise floor')
     for each in before.lines:
-        for order, found in [(1, each), *each.harmonics]:
-            _mark_line(axes, found.frequency, found.amplitude, order)
+        for order, tone in [(1, each), *each.harmonics]:
+            _mark_line(axes, tone.frequency, tone.amplitude, order)
     if before.lines:
         axes.plot([], [], color=style.GREEN, linewidth=0.8, linestyle=':', label='lines')
     tidy(axes, 'frequency / Hz', 'residual / nm Hz$^{-1/2}$')
@@ -234,15 +234,15 @@ def residual_dependence_figure(
     free = grid.ravel()[len(names) :]
     for axes in free:
         axes.set_axis_off()
-    shown: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for axes in grid.ravel()[: len(names)]:
         lines, labels = axes.get_legend_handles_labels()
-        shown |= dict(zip(labels, lines, strict=True))
+        entries |= dict(zip(labels, lines, strict=True))
         if not free.size:
             style.legend(axes)
     if free.size:
         # an empty place holds the legend of all, and covers no curve
-        style.legend(free[0], handles=list(shown.values()), labels=list(shown), loc='center')
+        style.legend(free[0], handles=list(entries.values()), labels=list(entries), loc='center')
     fig.align_ylabels(list(grid.ravel()))
     return fig
 

@@ -100,10 +100,10 @@ def png(picture: Figure, dpi: int | None = None) -> bytes:
 
 def safe(text: str, longest: int = 60) -> str:
     """Escape mathematics and control characters in a text, and shorten it."""
-    shown = printable(text)
-    if len(shown) > longest:
-        shown = shown[: longest - 3] + '...'
-    return shown.replace('$', r'\$')
+    one_line = printable(text)
+    if len(one_line) > longest:
+        one_line = one_line[: longest - 3] + '...'
+    return one_line.replace('$', r'\$')
 
 
 def figure(height: float, width: float = WIDTH) -> Figure:
@@ -129,8 +129,8 @@ def tidy(axes: Axes, xlabel: str = '', ylabel: str = '', title: str = '') -> Axe
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add a legend where it covers the least."""
-    given: dict[str, Any] = {'fontsize': SMALL, 'frameon': True, 'framealpha': 0.85}
-    axes.legend(**{**given, 'edgecolor': 'none', 'borderpad': 0.3, **options})
+    defaults: dict[str, Any] = {'fontsize': SMALL, 'frameon': True, 'framealpha': 0.85}
+    axes.legend(**{**defaults, 'edgecolor': 'none', 'borderpad': 0.3, **options})
 
 
 def length_unit(largest: float) -> tuple[str, float]:
@@ -173,13 +173,13 @@ def envelope(y: Array, points: int = POINTS) -> Integers:
     whole = y.size // stretch * stretch
     above, below = (np.where(np.isnan(y), x, y) for x in (np.inf, -np.inf))
     first = np.arange(whole // stretch) * stretch
-    found = [
+    kept = [
         first + above[:whole].reshape(-1, stretch).argmin(axis=1),
         first + below[:whole].reshape(-1, stretch).argmax(axis=1),
     ]
     if whole < y.size:
-        found.append(whole + np.array([above[whole:].argmin(), below[whole:].argmax()]))
-    return np.unique(np.concatenate([*found, [0, y.size - 1]]))
+        kept.append(whole + np.array([above[whole:].argmin(), below[whole:].argmax()]))
+    return np.unique(np.concatenate([*kept, [0, y.size - 1]]))
 
 
 def line(
