@@ -189,18 +189,9 @@ def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:
 
 def predict(model: StageModel, record: Record) -> tuple[Array, ...]:
     """
-    Predict the displacement from the voltage of a record; the measurement is not used.
+    Predict the displacement of each piece [m] from the voltage alone; the measurement is not used.
 
-    Parameters
-    ----------
-    model : StageModel
-    record : Record
-        The stage is at rest under the first sample.
-
-    Returns
-    -------
-    tuple of ndarray
-        Displacement of each piece [m].
+    The stage is at rest under the first sample of pieces that short gaps connect.
 
     Raises
     ------

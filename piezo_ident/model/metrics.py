@@ -45,8 +45,8 @@ def percent_of_stroke(y: Array, y_hat: Array, stroke: float | None = None) -> fl
     """
     Compute ``100 rms(y - y_hat) / (max y - min y)``, shapes (n,).
 
-    A `stroke` replaces ``max y - min y``, so that the whole record judges its parts.  The result
-    is infinite if the stroke is zero and the error is not.
+    A `stroke` replaces ``max y - min y``, so that the whole record judges its parts.  Without a
+    stroke, wild samples do not count as max or min, as in `strokes`.  See `percent` for zero.
     """
     span = strokes([('', y)])[''] if stroke is None else stroke
     return percent(float(np.sqrt(np.mean((y - y_hat) ** 2))), span)

@@ -281,7 +281,7 @@ class StageModel(FrontDoor):
         return Stream(self, start)
 
     def predict_piece(self, piece: Piece, start: StartLike = None) -> Array:
-        """Predict the displacement of a piece [m], shape (n,), as far as `check_rate` allows."""
+        """Predict the displacement [m], shape (n,), of a piece that `check_rate` accepts."""
         self.check_rate(piece)
         return self.stream(start).follow(piece)
 
