@@ -62,7 +62,7 @@ def test_the_cells_give_what_the_page_shows(tutorial, tmp_path, monkeypatch, bla
     # results and pictures show themselves, and the story is that of the page
     assert figures >= 5
     assert any(said.startswith('Slew limit explains') for said in shown)
-    before, after = (names[when].errors.percent for when in ('before', 'after'))
+    before, after = (names[when].errors.percent_without_offset for when in ('before', 'after'))
     assert before > 0.5 and after < 0.1
     # and of the two axes: each path is found, and the raster is predicted better with it
     (paths,) = (said for said in shown if 'cross_coupling' in said)
