@@ -57,9 +57,10 @@ QUANTITIES = (
     'largest, bias / scatter'
 )
 OFF = (
-    'Intervals that hold the reference [%], and scatter over stated deviation. On the grid the '
-    'reference is the truth, off the grid the fit of the same record without noise. The noise is '
-    '1e-4 of the stroke. Bias, and the least and largest of each: [coverage.csv](coverage.csv).'
+    'Intervals that hold the reference / the same without the bias [%], and scatter over stated '
+    'deviation. On the grid the reference is the truth, off the grid the fit of the same record '
+    'without noise. The noise is 1e-4 of the stroke. Bias, and the least and largest of each: '
+    '[coverage.csv](coverage.csv).'
 )
 #: of quantities, in the order of the page
 KINDS = ('static gain', 'loop width', 'gain', 'phase', 'modes')
@@ -266,7 +267,7 @@ def _pooled(quantities: Sequence[Quantity]) -> Iterator[tuple[object, ...]]:
 
 
 def _in_short(quantities: Sequence[Quantity]) -> Iterator[tuple[object, ...]]:
-    pooled = {row[:2]: f'{row[3]}, {row[6]}' for row in _pooled(quantities)}
+    pooled = {row[:2]: f'{row[3]} / {row[4]}, {row[6]}' for row in _pooled(quantities)}
     for variant in dict.fromkeys(variant for variant, _ in pooled):
         yield variant, *(pooled.get((variant, kind), '') for kind in KINDS)
 
