@@ -40,8 +40,7 @@ MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
 BLOCKS = 50
 #: number of plays of H, including the play at r = 0, unless the user sets it
 PLAYS = 40
-#: voltages for which H is fitted, normalised.  The densities of H end with this span.  It is wider
-#: than 0 .. 1, because similar motion may leave the range slightly (taste: a twentieth)
+#: voltages over which H must rise, normalised: similar motion may leave the range slightly (taste)
 SPAN = (-0.05, 1.05)
 #: the first 1/`RINGING` of a window is not fitted, as earlier motion may still ring there (taste)
 RINGING = 20

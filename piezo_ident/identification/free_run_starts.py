@@ -32,6 +32,8 @@ from scipy.signal import butter, sosfilt
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
 #: laws of H that are tried besides sums of plays
 WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
+#: voltages at which their densities end, normalised: they are smooth at the ends of the range
+WIDE = (-0.15, 1.15)
 #: first guess of an unknown memory at a start: all shares in the middle
 UNKNOWN = 0.5
 #: iterations of a rough fit and of a final fit
@@ -223,7 +225,7 @@ class Search:
         """Fit candidates with creep, with wider laws of H, and with both."""
         stage = best.fit.stage
         creeping = [self._more(best, 'creep', self._crept(stage, taus))]
-        laws = [HysteresisLaw(name, stage.law.thresholds, stage.law.span) for name in WIDER]
+        laws = [HysteresisLaw(name, stage.law.thresholds, WIDE) for name in WIDER]
         wider = [self._more(best, law.name, stage.with_law(law)) for law in laws]
         if shown_effect(creeping, best) is not None:
             law = min([best, *wider], key=lambda c: c.price).fit.stage.law
