@@ -77,10 +77,8 @@ class Inverse(Showable):
     ----------
     model : StageModel
         The inverted model.
-    t : ndarray, shape (n,)
-        Time [s].  The wanted motion begins at 0; the voltage may begin earlier.
-    v : ndarray, shape (n,)
-        Voltage [V].
+    t, v : ndarray, shape (n,)
+        Time [s] and voltage [V].  The wanted motion begins at 0; the voltage may begin earlier.
     wanted, predicted : ndarray, shape (n,)
         Wanted displacement, and displacement of the model under v [m].
     lead : int

@@ -55,9 +55,10 @@ class Linearised:
         """
         stage = self.stage
         G = np.zeros(stage.values.size, dtype=bool)
-        G[stage.place_of_dynamics] = True
+        own, offsets = stage.places
+        G[own] = True
         other = ~G
-        other[stage.place_of_offsets] = False
+        other[offsets] = False
         A, b = self.A.copy(), self.b.copy()
         for block, unused in ((of_G, other), (~of_G, G)):
             A[np.ix_(block, unused)], b[np.ix_(block, unused)] = 0.0, 0.0

@@ -184,27 +184,17 @@ class Stage:
 
     def _parts(self) -> list[slice]:
         """List the places of c, s, a and b, offsets, lags and starts among the values."""
-        G = self.dynamics
-        sizes = [
-            self.law.size,
-            self.creep.size,
-            0 if G.is_static else G.a.size + G.b.size,
-            self.offsets.size,
-            self.lags.size,
-            self.starts.size,
-        ]
-        ends = np.cumsum([0, *sizes])
+        own = self.dynamics
+        G = np.empty(0) if own.is_static else np.append(own.a, own.b)
+        parts = self.coefficients, self.creep, G, self.offsets, self.lags, self.starts
+        ends = np.cumsum([0, *(part.size for part in parts)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
     @property
-    def place_of_dynamics(self) -> slice:
-        """Place of a and b among the values."""
-        return self._parts()[2]
-
-    @property
-    def place_of_offsets(self) -> slice:
-        """Place of the offsets among the values."""
-        return self._parts()[3]
+    def places(self) -> tuple[slice, slice]:
+        """Places of a and b, and of the offsets, among the values."""
+        _, _, G, offsets, *_ = self._parts()
+        return G, offsets
 
     @property
     def bounds(self) -> tuple[Array, Array]:
