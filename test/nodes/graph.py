@@ -24,6 +24,7 @@ or wait with `matched`: both see to it that the nodes know of all readers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import functools
 import gc
 import os
 from pathlib import Path
@@ -31,7 +32,7 @@ import shutil
 import sys
 import tempfile
 import threading
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import yaml
@@ -41,6 +42,7 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from diagnostic_msgs.msg import DiagnosticArray
 from nursery import can_copy
 from observer import ENDS, Observer
+from piezo_ident.nodes.subscriptions import between_turns
 from processes import alive, crowd, Handle, in_time, LIMIT, listens, take_domain
 import rclpy
 from rclpy.context import Context
@@ -66,6 +68,9 @@ PROFILE = Path(__file__).with_name('prompt_discovery.xml')
 
 class Graph(Observer):
     """Node processes in a ROS domain of their own, and an observer."""
+
+    #: graphs of this process that spin
+    spinning: ClassVar[list[Graph]] = []
 
     def __enter__(self) -> Graph:
         self.domain, self._lock = take_domain()
@@ -106,6 +111,7 @@ class Graph(Observer):
         gc.freeze()
         self._thread = threading.Thread(target=self._spin, name='observer', daemon=True)
         self._thread.start()
+        self.spinning.append(self)
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -116,19 +122,36 @@ class Graph(Observer):
             self._end.set()
             # a node that is destroyed while the thread spins ends the process
             self._thread.join(60.0)
+            self.spinning.remove(self)
             # what is frozen keeps entities of nodes that are destroyed
             gc.unfreeze()
             # now and then the middleware does not come back from its wait: leave the node to it
             if not self._thread.is_alive():
-                self._executor.shutdown(timeout_sec=1.0)
-                self.node.destroy_node()
-                rclpy.shutdown(context=self.context)
+                self._destroy()
             shutil.rmtree(self.folder, ignore_errors=True)
             self._lock.close()
         if kind is None:
             assert not self._unknown, f'states that no table knows: {self._unknown}'
             # what ros2 topic echo shows of a text ends at 128 characters
             assert not self._unfit, f'too long, or the prose is not the last value: {self._unfit}'
+
+    def _destroy(self) -> None:
+        """Destroy the node while no observer of another graph waits, which ended the process."""
+        done = threading.Event()
+
+        def destroy() -> None:
+            try:
+                self._executor.shutdown(timeout_sec=1.0)
+                self.node.destroy_node()
+                rclpy.shutdown(context=self.context)
+            finally:
+                done.set()
+
+        work = destroy
+        for other in [g for g in self.spinning if g._thread.is_alive()]:
+            work = functools.partial(between_turns, other.node, work)
+        work()
+        assert done.wait(LIMIT)
 
     def _spin(self) -> None:
         while not self._end.is_set():
