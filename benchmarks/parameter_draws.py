@@ -19,7 +19,7 @@ import numpy as np
 import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.record.record import Piece, Segment
-from piezo_ident.uncertainty.parameters import quantities_of
+from piezo_ident.uncertainty.parameters import quantities_of, SAME_MODE
 from truths import Case, make_family_stage
 from truths.linear import pink
 
@@ -40,8 +40,6 @@ NOISE = 1e-4
 #: grids, noises and records; and the number of the draw without noise, which is the reference
 GRIDS, NOISES, RECORDS = ('on', 'off'), ('white', '1/f'), ('labelled', 'unlabelled')
 REFERENCE = -1
-#: a mode is that of the reference if their frequencies differ by less than this share
-SAME_MODE = 0.2
 #: name, value and deviation of quantities
 Rows = tuple[tuple[str, float, float], ...]
 #: a 95 % interval in deviations
@@ -147,21 +145,20 @@ class Quantity:
 
 def _as_named(rows: Rows, truth: Mapping[str, float]) -> Rows:
     """Name each mode as the nearest mode of the reference; drop what is said to be unknown."""
-    known = {name: f for name, f in truth.items() if name.startswith('G mode')}
-    names = {}
+    known = {name[2:]: f for name, f in truth.items() if name.startswith('G mode')}
+    same = {}
     for name, f, _ in rows:
         if name.startswith('G mode'):
-            same = min(known, key=lambda k: abs(known[k] / f - 1.0), default='')
-            if same and abs(known[same] / f - 1.0) < SAME_MODE:
-                names[name], names[name.replace('G ', 'G damping of ')] = (
-                    same,
-                    same.replace('G ', 'G damping of '),
-                )
-    return tuple(
-        (names[name] if 'mode' in name else name, value, std)
-        for name, value, std in rows
-        if np.isfinite(std) and ('mode' not in name or name in names)
-    )
+            off = {mode: abs(x / f - 1.0) for mode, x in known.items()}
+            nearest = min(off, key=off.__getitem__, default='')
+            if nearest and off[nearest] < SAME_MODE:
+                same[name[2:]] = nearest
+    found = []
+    for name, value, std in rows:
+        what, mode, number = name.partition('mode ')
+        if np.isfinite(std) and (not mode or mode + number in same):
+            found.append((what + same.get(mode + number, ''), value, std))
+    return tuple(found)
 
 
 def table(draws: Mapping[str, Draw], todo: Sequence[DrawTodo]) -> list[Quantity]:

@@ -242,8 +242,8 @@ SIMULATE = [
     _flag('--voltage-only', 'Write the columns t, v and segment, to drive a real stage.'),
 ]
 
-#: fields of `Settings`
 _solver = click.Choice(['least_squares', 'swarm', 'joint'])
+#: fields of `Settings`
 IDENTIFY = [
     _option('--thresholds', _thresholds, 'N|auto', 'Plays of H (default: by held-out error).'),
     _option('--order', _order, 'NA,NB', 'Order of G (default: searched).'),
