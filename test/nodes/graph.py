@@ -125,9 +125,7 @@ class Graph(Observer):
             self.spinning.remove(self)
             # what is frozen keeps entities of nodes that are destroyed
             gc.unfreeze()
-            # now and then the middleware does not come back from its wait: leave the node to it
-            if not self._thread.is_alive():
-                self._destroy()
+            self._destroy()
             shutil.rmtree(self.folder, ignore_errors=True)
             self._lock.close()
         if kind is None:
