@@ -288,7 +288,7 @@ def page(rows: Sequence[Covered], quantities: Sequence[Quantity], draws: int) ->
         'the others motion without labels. `make coverage` writes this page. This run: '
         f'**{len(groups["identified"])} identified stages, {len(groups["diagnosed"])} diagnosed '
         f'ones, {len(measured)} measured records, {draws} draws of parameters**, '
-        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 200, 100, 2 and 40. '
+        f'{sum(bool(r.error) for r in rows)} failed; the whole study has 150, 50, 2 and 20. '
         f'{machine()}.',
         '![Nominal against measured coverage by kind of motion](images/coverage.png)',
         ORACLE,
@@ -354,9 +354,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition('\n\n')[0])
     parser.add_argument('page', type=Path)
     parser.add_argument('--picture', type=Path, default=Path('docs/images/coverage.png'))
-    parser.add_argument('--identified', type=int, default=200, help='number of stages')
-    parser.add_argument('--diagnosed', type=int, default=100, help='number of stages')
-    parser.add_argument('--draws', type=int, default=40, help='draws of each noise')
+    parser.add_argument('--identified', type=int, default=150, help='number of stages')
+    parser.add_argument('--diagnosed', type=int, default=50, help='number of stages')
+    parser.add_argument('--draws', type=int, default=20, help='draws of each noise')
     parser.add_argument('--processes', type=int, default=os.cpu_count() or 1)
     parser.add_argument('--kept', type=Path, default=Path('build/coverage.jsonl'))
     args = parser.parse_args()
