@@ -27,6 +27,9 @@ def test_the_page_holds_what_the_rows_say(tmp_path):
     assert '| identified | 1 | 0.50 \\| 0.50 | 3.00 \\| 3.00 |' in text
     # five bins of two: off by 0.05, 0.25, 0.05, 0.35 and 0.15
     assert 'calibration error 0.17' in text and '5 of 10' in text
+    # weights of 0 and 1 that hold never err
+    sure = [Covered(f'diagnosed {k}', weight=k % 2, is_right=k < 3) for k in range(6)]
+    assert 'error 0.67 (wanted 0.07; weights that hold have 0.00' in page(sure, [], 0)
     picture(rows(), tmp_path / 'coverage.png')
     assert (tmp_path / 'coverage.png').stat().st_size > 1000
 
