@@ -19,7 +19,7 @@ from graph_page import STATES
 from piezo_ident.nodes.subscriptions import between_turns
 from piezo_ident.nodes.wire import from_message, LATCHED, SERVICE, STREAM, to_message
 from piezo_ident.record.blocks import Samples
-from processes import Handle, LIMIT
+from processes import Handle, LIMIT, WORK
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
@@ -249,7 +249,7 @@ class Observer:
         self.wait(found, f'{name} to be {" or ".join(states)}', timeout)
         return found()[0]
 
-    def finish(self, service: str, *states: str, timeout: float = LIMIT) -> dict[str, str]:
+    def finish(self, service: str, *states: str, timeout: float = WORK) -> dict[str, str]:
         """Call a service, and return the status in which its node ends what that began."""
         name = service.rpartition('/')[0]
         since = len(self.statuses(name))

@@ -21,6 +21,8 @@ from nursery import can_copy, Copy, die_with_parent, Nursery
 
 #: what has not happened within this time will not happen [s]; the machine may be busy
 LIMIT = 60.0
+#: the same for work that computes, as an identification or pictures: a share of a busy machine
+WORK = 180.0
 #: domains whose ports are clear of the system's own
 DOMAINS = range(1, 100)
 NURSERY = Nursery()

@@ -9,7 +9,6 @@ import json
 from course import column
 from graph import Graph
 import numpy as np
-from observer import LIMIT
 import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.modes.modal import Modal
@@ -70,7 +69,7 @@ def identified(lab, tmp_path_factory):
     lab.until('recorder', 'recording')
     assert lab.set('excitation', 'in_turn', True)[0]
     # two axes are as much work as two runs
-    end = lab.finish('identifier/run', timeout=2 * LIMIT)
+    end = lab.finish('identifier/run')
     assert end['state'] == 'done', end['text']
     assert lab.set('excitation', 'in_turn', False)[0]
     lab.finish('recorder/stop')
