@@ -91,7 +91,6 @@ def expand_apart(
 ) -> tuple[list[Path], list[Path]]:
     """List the records for a model and for its validation; refuse a record in both."""
     paths, further = expand(records, console), expand(validation, console)
-    # realpath, because Path.resolve raises its own error for circular links
     fitted = set(map(os.path.realpath, paths))
     for path in further:
         if os.path.realpath(path) in fitted:
@@ -147,7 +146,8 @@ def read_all(
     """
     check_bag_options(paths, args)
     options = replace(options_of(args), **further)
-    names = Counter(path.name for path in {path.resolve(): path for path in paths}.values())
+    # realpath, because Path.resolve raises its own error for circular links
+    names = Counter(path.name for path in {os.path.realpath(p): p for p in paths}.values())
     records = []
     for path in paths:
         try:
@@ -272,7 +272,6 @@ def check_distinct(output: Path, inputs: Iterable[Path]) -> None:
 
 def check_apart(output: Path, record: Path) -> None:
     """Refuse an output that is the record, lies in its folder, or contains it."""
-    # realpath, because Path.resolve raises its own error for circular links
     out, source = (Path(os.path.realpath(path)) for path in (output, record))
     if out == source or out in source.parents or source in out.parents:
         raise DataError(

@@ -229,7 +229,8 @@ def run_many(
 
 
 def _prepare(records: Sequence[Path], folder: Path, task: Task, reports: bool) -> list[_Job]:
-    target = folder.resolve()
+    # realpath, because Path.resolve raises its own error for circular links
+    target = Path(os.path.realpath(folder))
     places: dict[str, Path] = {}
     for record in records:
         # the workers may have another working directory
@@ -240,7 +241,7 @@ def _prepare(records: Sequence[Path], folder: Path, task: Task, reports: bool) -
         places[name] = path
     models = [task.model_of(name) for name in places] if isinstance(task, Diagnose) else []
     for path in (*places.values(), *models):
-        if path.resolve().is_relative_to(target):
+        if Path(os.path.realpath(path)).is_relative_to(target):
             raise ConfigError(f'{folder}: holds the input {path}; choose another folder')
     mark = folder / MARK
     try:

@@ -99,6 +99,8 @@ COMMANDS = (
     ('predict T/loop.yaml R', 'loop.yaml: is a link to', 'mend the link'),
     ('simulate --config T/loop.yaml T/r.csv', 'is a link to', 'mend the link'),
     ('identify R --model T/loop.yaml', 'is a link to', 'mend the link'),
+    ('identify T/loop.yaml', 'loop.yaml: is a link to', 'mend the link'),
+    ('identify R --each T/loop.yaml', 'loop.yaml: cannot be written'),
     ('identify R --report T/gone.csv/below', 'gone.csv: is a link to', 'mend the link'),
 )
 #: outputs that could not be written, which is found before the work
