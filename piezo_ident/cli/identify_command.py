@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from piezo_ident import report
 from piezo_ident.cli.console import Console, deferred_interrupts
 from piezo_ident.cli.each_command import check_each, identify_each
 from piezo_ident.cli.files import (
@@ -48,8 +49,6 @@ def identify_command(args: SimpleNamespace, console: Console) -> None:
     if args.each is not None:
         identify_each(args, settings, console)
         return
-    from piezo_ident import report
-
     paths, further = checked(args, Identification, console)
     records, validation = read_both(paths, further, args, console)
     with naming(*(record.name for record in records)), console.progress() as progress:
@@ -76,8 +75,6 @@ def checked(
     args: SimpleNamespace, kind: type, console: Console, *others: Path
 ) -> tuple[list[Path], list[Path]]:
     """List the records for the work and for validation; refuse bad outputs before the work."""
-    from piezo_ident.report import check_report_folder
-
     paths, further = expand_apart(args.records, args.validation, console)
     inputs = [*others, *paths, *further]
     if args.report is not None:
@@ -95,7 +92,7 @@ def checked(
                 raise ConfigError(f'{folder}: holds the report of {other}; choose another folder')
             for name in ('model.yaml', 'diagnosis.json', 'report.html'):
                 check_distinct(folder / name, inputs)
-            check_report_folder(folder, kind)
+            report.check_report_folder(folder, kind)
             if (folder / 'report.html').exists() and not args.overwrite:
                 raise DataError(
                     f'{folder}: holds a report already; choose another folder or add --overwrite'
@@ -113,13 +110,11 @@ def read_both(
 
 def prompt_of(args: SimpleNamespace, records: Sequence[Record], paths: Sequence[Path]) -> Prompt:
     """Collect the names of the files of a call, for the suggested commands."""
-    from piezo_ident.report import Prompt
-
     given = getattr(args, 'model_file', '')
     written = args.report and args.report / 'model.yaml'
     read = {x.opts[0]: getattr(args, str(x.name)) for x in READING}
     words = [[name, *_words(x)] for name, x in read.items() if x is not None]
-    return Prompt(
+    return report.Prompt(
         model=str(args.model or written or ('refined.yaml' if given else 'model.yaml')),
         given=str(given),
         records={x.name: str(path) for x, path in zip(records, paths, strict=True)},
@@ -136,9 +131,7 @@ def _words(value: Any) -> list[str]:
 
 def print_next(result: Results, prompt: Prompt, console: Console) -> list[dict[str, str]]:
     """Print the suggested next steps with their command lines; return them for JSON."""
-    from piezo_ident.report import next_steps
-
-    steps = next_steps(result, prompt)
+    steps = report.next_steps(result, prompt)
     console.say('\nnext:')
     for step in steps:
         console.say(textwrap.indent(textwrap.fill(f'{step.reason}:', 97), '  '))
@@ -149,11 +142,9 @@ def print_next(result: Results, prompt: Prompt, console: Console) -> list[dict[s
 
 def keep(result: Results, args: SimpleNamespace, prompt: Prompt) -> None:
     """Write report and model to the places in the arguments."""
-    from piezo_ident.report import write_report
-
     with deferred_interrupts() as check:
         if args.report is not None:
-            write_report(result, args.report, progress=check, prompt=prompt)
+            report.write_report(result, args.report, progress=check, prompt=prompt)
         if args.model is not None:
             result.model.save(args.model)
 
@@ -171,5 +162,5 @@ def print_files(
         console.say(f'report: {page}')
     if args.model is None and not pages:
         console.say('nothing was written; --model YAML keeps the model, --report DIR the report')
-    report = pages if pages[1:] else next(iter(pages), None)
-    return {'model': None if args.model is None else str(args.model), 'report': report}
+    model = None if args.model is None else str(args.model)
+    return {'model': model, 'report': pages if pages[1:] else next(iter(pages), None)}

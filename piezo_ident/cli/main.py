@@ -249,6 +249,11 @@ def _told(error: click.UsageError) -> str:
     return f'{text} (see {error.ctx.command_path if error.ctx else "piezo_ident"} --help)'
 
 
+def _discard_output() -> None:
+    # the reader has closed the pipe, or the disk is full; the final flush must not fail again
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, by default with the arguments of the process; return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -256,13 +261,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     def stop(code: int, text: str, kind: str) -> int:
         line = ' '.join(text.split('\n'))
         sys.stderr.write(f'piezo_ident: {"error: " if code == BAD_INPUT else ""}{line}\n')
-        if '--json' in words:
-            data = {'kind': kind, 'message': line, 'exit_code': code}
-            sys.stdout.write(f'{json.dumps({"error": data}, indent=2, ensure_ascii=False)}\n')
+        try:
+            if '--json' in words:
+                data = {'kind': kind, 'message': line, 'exit_code': code}
+                sys.stdout.write(f'{json.dumps({"error": data}, indent=2, ensure_ascii=False)}\n')
+            sys.stdout.flush()
+        except OSError:
+            _discard_output()
         return code
 
     try:
-        for stream in (sys.stdout, sys.stderr):
+        for name in ('stdout', 'stderr'):
+            # None where the caller has closed it: nobody reads
+            stream = getattr(sys, name) or open(os.devnull, 'w', encoding='utf-8')
+            setattr(sys, name, stream)
             # a terminal without micro signs gets question marks instead of a traceback
             if hasattr(stream, 'reconfigure'):
                 stream.reconfigure(errors='replace')
@@ -289,8 +301,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         return stop(INTERRUPTED, 'interrupted; no output is half written', 'Interrupted')
     except BrokenPipeError:
-        # the reader has closed the pipe; the final flush of the interpreter must not fail
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
     except click.UsageError as error:
         return stop(BAD_INPUT, _told(error), 'UsageError')
     except PiezoIdentError as error:

@@ -503,3 +503,23 @@ def test_a_reader_that_leaves_is_no_error():
     )
     os.close(write)
     assert (done.returncode, done.stderr) == (0, b'')
+
+
+@pytest.mark.parametrize(
+    ('words', 'end'),
+    [
+        ('effects >&-', (0, b'')),
+        ('effects nope --json >&- 2>&-', (2, b'')),
+        ('effects >/dev/full', (2, b'piezo_ident: error: No space left on device\n')),
+    ],
+)
+def test_output_that_cannot_be_written(words, end):
+    # a buffered output fails at its end, and again while the interpreter ends
+    env = {**os.environ, 'PYTHONUNBUFFERED': ''}
+    done = subprocess.run(
+        f'{shlex.quote(sys.executable)} -m piezo_ident {words}',
+        shell=True,
+        stderr=subprocess.PIPE,
+        env=env,
+    )
+    assert (done.returncode, done.stderr) == end
