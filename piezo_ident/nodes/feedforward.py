@@ -130,13 +130,14 @@ class FeedforwardNode(DrivingNode):
 
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, another window, or other limits."""
-        if path := changed.get('model'):
-            self._loader.load_file(path)
         if 'window' in changed:
             self._errors.set_window(changed['window'])
         if (model := self._model) is not None and set(changed) & set(LIMITS):
             self._tracker = None
             self._loader.load(self._source, lambda: model)
+        # the loader keeps the newest wish, which is the file
+        if path := changed.get('model'):
+            self._loader.load_file(path)
 
     def _prepared(self, model: Model) -> Prepared:
         # runs in the thread of the loader
@@ -152,7 +153,11 @@ class FeedforwardNode(DrivingNode):
             kept = 'the old model is kept' if self._tracker else 'there is no model'
             self._refusal = f'model refused, {kept}: {source}'
             return
-        self._model, new = loaded
+        model, new = loaded
+        if self._is_outdated(new):
+            self._loader.load(source, lambda: model)
+            return
+        self._model = model
         if not isinstance(new, Successor):
             self._tracker = new
         elif self._tracker is not None:
@@ -162,6 +167,12 @@ class FeedforwardNode(DrivingNode):
         if self._models > 1:
             self.journal.tell(f'{self._state}: model {self._models} is taken over, {source}')
         self._errors.clear()
+
+    def _is_outdated(self, new: Tracker | Successor) -> bool:
+        """Return whether the limits have changed since a model was prepared."""
+        if isinstance(new, Successor):
+            return self._tracker is None
+        return (new.settings, new.follow) != (self._settings(), self.values['follow'])
 
     # services
 

@@ -6,11 +6,13 @@
 from dataclasses import replace
 import re
 import time
+from types import SimpleNamespace
 
 from course import block, column, FS, model_of, paper
 from graph import Graph, in_time
 import numpy as np
 from piezo_ident.model.files import model_to_yaml
+from piezo_ident.nodes.feedforward import FeedforwardNode
 import pytest
 from std_msgs.msg import Float64MultiArray
 
@@ -341,3 +343,45 @@ def test_a_signal_ramps_to_rest(lab):
     _, v = column(voltage[since:])
     assert np.abs(np.diff(v)).max() < 0.1
     in_time(took, 2.0, 'the end of the node')
+
+
+class Idle(FeedforwardNode):
+    """An idle node without ROS; `wishes` has the sources of the models that it asks for."""
+
+    def __init__(self):
+        limits = {'voltage_low': 0.0, 'voltage_high': 10.0, 'rest': 0.0}
+        self.values = {**limits, 'slew': 4e4, 'ramp_slew': 20.0, 'follow': 'off'}
+        self._rate_of_clock, self._tails, self._state = FS, [''], 'idle'
+        self._model, self._source, self._refusal, self._models = 'old', 'old.yaml', '', 0
+        self._errors, self.wishes = SimpleNamespace(clear=lambda: None), []
+        self._loader = SimpleNamespace(
+            load=lambda source, read: self.wishes.append((source, read())),
+            load_file=lambda path: self.wishes.append((path, 'file')),
+        )
+        self._tracker = self.tracker()
+
+    def tracker(self):
+        """Return a tracker for the present limits."""
+        return SimpleNamespace(settings=self._settings(), follow=self.values['follow'])
+
+    def set(self, **changed):
+        """Set parameters."""
+        self.values |= changed
+        self.apply(changed)
+
+
+def test_a_model_that_is_set_together_with_limits_is_the_last_one_to_be_loaded():
+    node = Idle()
+    node.set(model='new.yaml', voltage_high=5.0)
+    assert node.wishes[-1] == ('new.yaml', 'file')
+
+
+def test_a_model_that_was_prepared_for_earlier_limits_is_prepared_again():
+    node = Idle()
+    late = 'new', node.tracker()
+    node.set(voltage_high=5.0)
+    node.wishes.clear()
+    node._take_model(late, 'topic model')
+    assert node.wishes == [('topic model', 'new')] and node._tracker is None
+    node._take_model(('new', node.tracker()), 'topic model')
+    assert node._tracker.settings.high == 5.0 and node._model == 'new'
