@@ -38,6 +38,8 @@ class LiveLearning:
 
     Attributes
     ----------
+    settings : GuardSettings
+        Limits for which the repetitions are planned.
     each : dict of str to Learning
         By the names of the axes.
     voltage : ndarray, shape (k, m)
@@ -53,7 +55,7 @@ class LiveLearning:
         settings: GuardSettings,
         axes: Sequence[str] = ('y',),
     ) -> None:
-        self.model, self.reference, self._settings = model, reference, settings
+        self.model, self.reference, self.settings = model, reference, settings
         limits, rows = (settings.low, settings.high), dict(zip(axes, reference, strict=True))
         self._learning = AxesLearning(model, rows, limits=limits, slew=settings.slew)
         self.each = {axis: self._learning.each[axis] for axis in axes}
@@ -61,7 +63,7 @@ class LiveLearning:
 
     def again(self) -> None:
         """Plan a repetition."""
-        s, drives = self._settings, [one.drive for one in self.each.values()]
+        s, drives = self.settings, [one.drive for one in self.each.values()]
         lead = max(drive.lead for drive in drives)
         v = np.stack([np.pad(x.v, (lead - x.lead, 0), mode='edge') for x in drives])
         way = math.ceil(2.0 * np.abs(v[:, 0] - s.rest).max() / s.ramp_step)
@@ -75,7 +77,7 @@ class LiveLearning:
 
     def measured(self, samples: Samples, tick: int, axis: int = 0) -> None:
         """Take displacement of an axis; `tick` is the first sample of the repetition."""
-        k = np.rint(samples.t * self._settings.sample_rate).astype(np.int64) - tick - self._first
+        k = np.rint(samples.t * self.settings.sample_rate).astype(np.int64) - tick - self._first
         inside = (k >= 0) & (k < self._measured.shape[1])
         self._measured[axis, k[inside]] = samples.values[inside]
 

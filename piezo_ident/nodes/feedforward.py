@@ -191,8 +191,9 @@ class FeedforwardNode(DrivingNode):
         model, settings, before = self._model, self._settings(), self._learned
 
         def make() -> LiveLearning:
-            if before and before.model is model and np.array_equal(before.reference, kept):
-                return before
+            if before and before.model is model and before.settings == settings:
+                if np.array_equal(before.reference, kept):
+                    return before
             return LiveLearning(model, kept, settings, axes)
 
         self._learner = Learner(make, self.values['repetitions'], self._played)

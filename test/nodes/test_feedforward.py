@@ -12,6 +12,7 @@ from course import block, column, FS, model_of, paper
 from graph import Graph, in_time
 import numpy as np
 from piezo_ident.model.files import model_to_yaml
+from piezo_ident.nodes import feedforward
 from piezo_ident.nodes.feedforward import FeedforwardNode
 import pytest
 from std_msgs.msg import Float64MultiArray
@@ -385,3 +386,18 @@ def test_a_model_that_was_prepared_for_earlier_limits_is_prepared_again():
     assert node.wishes == [('topic model', 'new')] and node._tracker is None
     node._take_model(('new', node.tracker()), 'topic model')
     assert node._tracker.settings.high == 5.0 and node._model == 'new'
+
+
+def test_learning_goes_on_within_the_same_limits_alone(monkeypatch):
+    monkeypatch.setattr(feedforward, 'Learner', lambda make, *_: make())
+    monkeypatch.setattr(feedforward, 'LiveLearning', lambda *_: 'planned anew')
+    node, kept = Idle(), np.zeros((1, 10))
+    node.values |= {'longest': 1.0, 'repetitions': 1}
+    node._wanted, node._begin = SimpleNamespace(kept=kept, length=10), lambda: None
+    before = SimpleNamespace(model='old', reference=kept, settings=node._settings())
+    node._learned = before
+    node._learn()
+    assert node._learner is before
+    node.values['voltage_high'] = 5.0
+    node._learn()
+    assert node._learner == 'planned anew'
