@@ -139,7 +139,10 @@ class IdentifierNode(LabNode):
 
     def _is_busy(self) -> bool:
         # parameters are declared before the other attributes exist
-        return hasattr(self, '_excitation') and (self._excitation.running or self._worker.is_busy)
+        if not hasattr(self, '_excitation'):
+            return False
+        # a job has ended when its outcome is taken
+        return self._excitation.running or self._worker.is_busy or bool(self._outcomes)
 
     def _refuse_when_busy(self) -> None:
         if self._is_busy():

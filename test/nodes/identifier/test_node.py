@@ -8,10 +8,13 @@ import os
 from pathlib import Path
 import threading
 import time
+from types import SimpleNamespace
 
 from course import first_of, model_of, numbers, pairs_of, SETTINGS, simulated
 from graph import Graph, in_time
 import numpy as np
+from piezo_ident.common.errors import PiezoIdentError
+from piezo_ident.nodes.identifier.node import IdentifierNode
 from piezo_ident.nodes.wire import LATCHED, to_message
 from piezo_ident.record.blocks import Samples
 import pytest
@@ -373,3 +376,16 @@ def test_no_more_is_kept_than_the_limit(empty, blocks):
     assert float(empty.diagnostics('identifier')['room']) <= 0.1
     end = empty.finish('identifier/identify_delay')
     assert end['level'] != '0', end
+
+
+class Ended(IdentifierNode):
+    """A node without ROS whose job has ended, and whose outcome was not taken yet."""
+
+    def __init__(self):
+        self._excitation, self._worker = SimpleNamespace(running=False), SimpleNamespace()
+        self._worker.is_busy, self._outcomes, self._task = False, [print], 'identification'
+
+
+def test_work_ends_when_its_outcome_is_taken():
+    with pytest.raises(PiezoIdentError, match='busy: identification'):
+        Ended()._clear()
