@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.axes import build_axes
 from piezo_ident.excitation.program import parse_program, Program, Sequence
 from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
@@ -223,8 +223,9 @@ class ExcitationNode(LabNode):
             self._play(playing)
         except _Stopped:
             self._ramp(playing, 'stopped', 'stopped')
-        except PiezoIdentError as error:
-            self._ramp(playing, 'failed', str(error))
+        # the status has to report any failure of this thread
+        except Exception as error:  # noqa: BLE001
+            self._ramp(playing, 'failed', self.reason(error))
         else:
             clock, behind = playing.clock, ''
             level = WARN if playing.second else OK

@@ -12,6 +12,7 @@ from graph import Graph, in_time
 import numpy as np
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.simulated_stage import SimulatedStage
+from piezo_ident.nodes.excitation import ExcitationNode
 from piezo_ident.record.blocks import cut_blocks
 import pytest
 from std_msgs.msg import Float64MultiArray
@@ -326,3 +327,26 @@ def test_it_says_what_it_drives_and_by_how_much_blocks_were_late(lab):
     late = re.search(r'(\d+) blocks late, by up to (\d+) ms', lab.status('excitation')['text'])
     # a longer pause moves the schedule, and all behind it are in time
     assert late and int(late[1]) >= 1 and int(late[2]) >= 80
+
+
+class Failing(ExcitationNode):
+    """A node without ROS whose middleware fails during a program; `ramps` has its ramps."""
+
+    def __init__(self):
+        self.ramps = []
+
+    def _await_graph(self, playing):
+        raise RuntimeError('no more memory for messages')
+
+    def _ramp(self, playing, *said):
+        self.ramps.append(said)
+
+    def reason(self, error):
+        """Return the text of an error."""
+        return str(error)
+
+
+def test_any_failure_while_playing_ramps_to_rest_and_is_reported():
+    node = Failing()
+    node._run(None)
+    assert node.ramps == [('failed', 'no more memory for messages')]
