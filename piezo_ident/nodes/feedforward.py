@@ -169,9 +169,13 @@ class FeedforwardNode(DrivingNode):
         self._errors.clear()
 
     def _is_outdated(self, new: Tracker | Successor) -> bool:
-        """Return whether the limits have changed since a model was prepared."""
+        """Return whether a model was prepared for other limits, or for a voltage long ago."""
+        tracker = self._tracker
         if isinstance(new, Successor):
-            return self._tracker is None
+            # the voltage is kept sample by sample for some seconds
+            return tracker is None or tracker.past().since(new.count).size < (
+                tracker.tick - new.count
+            )
         return (new.settings, new.follow) != (self._settings(), self.values['follow'])
 
     # services

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from course import block, column, FS, model_of, paper
 from graph import Graph, in_time
 import numpy as np
+from piezo_ident.live.axis_drive import Successor
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.nodes import feedforward
 from piezo_ident.nodes.feedforward import FeedforwardNode
@@ -386,6 +387,16 @@ def test_a_model_that_was_prepared_for_earlier_limits_is_prepared_again():
     assert node.wishes == [('topic model', 'new')] and node._tracker is None
     node._take_model(('new', node.tracker()), 'topic model')
     assert node._tracker.settings.high == 5.0 and node._model == 'new'
+
+
+@pytest.mark.parametrize(('count', 'wishes'), [(99, [('topic model', 'new')]), (100, [])])
+def test_a_model_that_was_prepared_before_the_kept_voltage_is_prepared_again(count, wishes):
+    node, taken = Idle(), []
+    past = SimpleNamespace(since=lambda n: np.zeros(min(100, 200 - n)))
+    node._tracker.tick, node._tracker.past = 200, lambda: past
+    node._tracker.take_over = taken.append
+    node._take_model(('new', Successor(None, count)), 'topic model')
+    assert node.wishes == wishes and len(taken) == (not wishes)
 
 
 def test_learning_goes_on_within_the_same_limits_alone(monkeypatch):
