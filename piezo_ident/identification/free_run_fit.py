@@ -198,14 +198,13 @@ def _taus(stretches: Sequence[Stretch]) -> Array:
 
 def _fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], list[Mask]]:
     """
-    Choose the runs that are fitted, the widest first, and the fitted samples of each.
+    Choose the widest runs, in the order of recording, and the fitted samples of each.
 
     With `hold_out` the end of each run is held out, else a few stretches spread over it.  Raises
     IdentificationError if the widest run has too few samples to fit or to judge by.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
-    chosen: list[Run] = []
-    masks: list[Mask] = []
+    masks: dict[Run, Mask] = {}
     for run in ranked[:MOST_RUNS]:
         piece, rate = run.piece, run.piece.sample_rate
         share = max(1.5, 0.2 * piece.duration)
@@ -213,7 +212,7 @@ def _fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], l
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
         if n_held < MIN_HELD or n_fit < MIN_FIT:
-            if chosen:
+            if masks:
                 continue
             raise IdentificationError(
                 f'{run.record}: holding out {held_time:.3g} s leaves {max(n_fit, 0)} samples to '
@@ -225,10 +224,11 @@ def _fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], l
         else:
             fitted = ~held_out_stretches(run.u, rate, n_held)
         enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
-        if enough or not chosen:
-            chosen.append(run)
-            masks.append(fitted)
-    return chosen, masks
+        if enough or not masks:
+            masks[run] = fitted
+    # the model takes the zero of displacement of the last run
+    chosen = [run for run in runs if run in masks]
+    return chosen, [masks[run] for run in chosen]
 
 
 def held_out_stretches(u: Array, rate: float, n_held: int) -> Mask:

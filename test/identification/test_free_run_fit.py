@@ -9,9 +9,12 @@ import numpy as np
 from paper_stage import PAPER
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
+from piezo_ident.identification.free_run_fit import _fitted_parts
 from piezo_ident.identification.identify import identify
+from piezo_ident.identification.prepare import runs_of
 from piezo_ident.identification.settings import Settings
 from piezo_ident.model.free_run import free_run
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
@@ -117,6 +120,24 @@ def test_several_records_are_all_fitted_each_with_its_own_zero():
     # the model has the zero of the last record, where the sensor was last
     later = record('later', sine(1.0, f=3.0), 4e-6, 2)
     assert abs(free_run(result.model, later).errors.offset) < 0.1e-6
+
+
+def plain_runs(*voltages):
+    """Return runs of 1 kHz whose displacement is the voltage, named 0, 1 and so on."""
+    records = [
+        Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0, name=str(i))
+        for i, v in enumerate(voltages)
+    ]
+    return runs_of(records, 1000.0, Scaling(0.0, 10.0, 0.0, 1e-5, (0.0, 10.0)))
+
+
+@pytest.mark.parametrize('sizes', [(1.0, 0.5), (0.5, 1.0)])
+def test_fitted_runs_keep_the_order_of_recording(sizes):
+    # the model takes the zero of the last run, whichever is the widest
+    runs = plain_runs(*(size * sine(0.4) for size in sizes))
+    chosen, masks = _fitted_parts(runs, Settings())
+    assert [run.record for run in chosen] == ['0', '1']
+    assert [mask.size for mask in masks] == [2000, 2000]
 
 
 def test_a_multisine_does_not_only_jump():
