@@ -153,34 +153,34 @@ def _search(
 def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Choose three windows: of the widest motion, of the fastest, and of the largest jump."""
     size = WINDOWED // 3
-    windows = []
-    for s in stretches:
-        for start in range(0, max(1, s.u.size - size // 2), size):
-            part = slice(start, min(start + size, s.u.size))
-            if s.use[part].sum() > size // 4:
-                windows.append((s, part))
+    parts = [
+        (s, slice(start, min(start + size, s.u.size)))
+        for s in stretches
+        for start in range(0, max(1, s.u.size - size // 2), size)
+    ]
+    used = [int(s.use[part].sum()) for s, part in parts]
+    # a long part that is held out may leave few samples in any window
+    enough = min(size // 4 + 1, max(used))
+    windows = [window for window, n in zip(parts, used, strict=True) if n >= enough]
     spans = [float(np.ptp(s.u[part])) for s, part in windows]
     speeds = [float(np.mean(np.diff(s.u[part]) ** 2)) for s, part in windows]
     jumps = [float(np.max(np.abs(np.diff(s.u[part])))) for s, part in windows]
     order = [int(np.argmax(x)) for x in (spans, speeds, jumps)]
     order += sorted(range(len(windows)), key=lambda i: -spans[i] * speeds[i])
     chosen = list(dict.fromkeys(order))[:3]
-    short_stretches, count = [], 0
+    short = []
     for number, i in enumerate(sorted(chosen)):
         s, part = windows[i]
         # windows are short: finer blocks allow more of them to be held out
         length = s.u[part].size
-        block = np.arange(length) * (BLOCKS // 3) // length + count
-        count += BLOCKS // 3
+        block = (number * length + np.arange(length)) * (BLOCKS // 3) // length
         use, before = s.use[part].copy(), np.empty(0)
         if part.start:
             before = remembered(s.u[: part.start + 1])
             # ringing from before the window is unknown
             use[: length // RINGING] = False
-        short_stretches.append(
-            Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before)
-        )
-    return short_stretches
+        short.append(Stretch(s.u[part], s.x[part], use, block, s.rate, number, s.record, before))
+    return short
 
 
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:

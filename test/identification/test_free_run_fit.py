@@ -9,7 +9,8 @@ import numpy as np
 from paper_stage import PAPER
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
-from piezo_ident.identification.free_run_fit import _fitted_parts
+from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.identification.free_run_fit import _fitted_parts, _windows
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.identification.settings import Settings
@@ -138,6 +139,15 @@ def test_fitted_runs_keep_the_order_of_recording(sizes):
     chosen, masks = _fitted_parts(runs, Settings())
     assert [run.record for run in chosen] == ['0', '1']
     assert [mask.size for mask in masks] == [2000, 2000]
+
+
+def test_a_long_record_with_a_short_fitted_part_has_a_window():
+    # 0.2 s of 6 s at 20 kHz are fitted
+    u = sine(24.0, f=1.0) / 10.0
+    use = np.arange(u.size) < 4000
+    stretch = Stretch(u, u, use, np.arange(u.size) * 50 // u.size, 20_000.0)
+    (window,) = _windows([stretch])
+    assert window.use.sum() == 4000
 
 
 def test_a_multisine_does_not_only_jump():
