@@ -104,28 +104,28 @@ def _by_least_squares(
     delays: Sequence[int],
 ) -> list[tuple[tuple[int, int], int, Dynamics]]:
     """Fit a stable G at each order and its `NEAR` best delays, by least squares (ARX)."""
+    # lags cover the delays that differ; a delay that all candidates share shifts the input
+    least = min(delays)
     parts = [
-        (w[a:b], x[a:b])
+        (delayed(w, least)[a:b], x[a:b])
         for (w, x), s in zip(pairs, stretches, strict=True)
         for a, b in true_runs(s.use)
     ]
     fits = []
     # a long order needs long parts; use the largest order for which a part is long enough
     for most in sorted({na for na, _ in orders}, reverse=True):
-        lags = max(nb for na, nb in orders if na <= most) + max(delays) + 1
+        lags = max(nb for na, nb in orders if na <= most) + max(delays) - least + 1
         long = [(w, x) for w, x in parts if w.size > 3 * (most + lags)]
         if long:
             break
     else:
         return []
     factor = factor_of(long, most, lags)
-    for na, nb in orders:
-        if na > most:
-            continue
+    for na, nb in (order for order in orders if order[0] <= most):
         # the one-step loss points to the delay; a neighbour may have the smaller free-run error
-        losses = {d: factor.fit(na, nb, d)[1] for d in delays}
+        losses = {d: factor.fit(na, nb, d - least)[1] for d in delays}
         for d in sorted(losses, key=lambda d: losses[d])[:NEAR]:
-            G = stabilised(factor.dynamics(na, nb, d))
+            G = stabilised(factor.dynamics(na, nb, d - least))
             if G.is_stable and 0.0 < G.gain < np.inf:
                 fits.append(((na, nb), d, G))
     return fits

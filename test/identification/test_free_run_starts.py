@@ -6,8 +6,8 @@
 import numpy as np
 from numpy.testing import assert_allclose
 from piezo_ident.fitting.stage import PARTS
-from piezo_ident.fitting.stretch import Stretch
-from piezo_ident.identification.free_run_starts import Allowed, Search
+from piezo_ident.fitting.stretch import delayed, Stretch
+from piezo_ident.identification.free_run_starts import Allowed, linear_starts, Search
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.operators.play import play_columns
 from piezo_ident.selection.motion_kinds import interleaved
@@ -95,6 +95,17 @@ def test_a_chirp_in_much_noise_shows_both_modes():
     modes = [m for m in modes if m.frequency < 4000.0]
     assert [round(mode.frequency / 10.0) for mode in modes] == [90, 230]
     assert_allclose([mode.damping for mode in modes], [0.01, 0.015], rtol=0.05)
+
+
+def test_a_long_delay_of_the_user_takes_no_lags():
+    # the delay is half of the fitted parts between held-out samples
+    w = np.append(0.0, np.cumsum(np.random.default_rng(0).standard_normal(1999)))
+    x = delayed(signal.lfilter([0.3], [1.0, -1.5, 0.8], w), 200)
+    use = np.arange(2000) % 500 < 400
+    stretch = Stretch(w, x, use, np.zeros(2000, dtype=int), FS)
+    [(delay, G)] = linear_starts([w], [stretch], Allowed(200, (2, 1)), ()).values()
+    assert delay == 200
+    assert_allclose([*G.a, *G.b], [-1.5, 0.8, 0.3], atol=1e-3)
 
 
 def test_one_slow_sine_shows_no_mode_but_what_its_start_rings():
