@@ -28,7 +28,7 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect
 from scipy.signal import butter, sosfilt
 
-#: orders na of G that are tried, with nb = na + 1, and the orders of the first rough fits
+#: orders na of G that are tried, with nb = na + 1 or the largest, and the orders of rough fits
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
 #: laws of H that are tried besides sums of plays
 WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
@@ -68,7 +68,7 @@ class Allowed:
         """Select the orders of a list that may be tried."""
         if self.order is not None:
             return [self.order]
-        return [(n, n + 1) for n in of if n <= self.largest]
+        return [(n, min(n + 1, self.largest)) for n in of if n <= self.largest]
 
 
 def linear_starts(

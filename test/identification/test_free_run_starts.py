@@ -97,6 +97,12 @@ def test_a_chirp_in_much_noise_shows_both_modes():
     assert_allclose([mode.damping for mode in modes], [0.01, 0.015], rtol=0.05)
 
 
+def test_no_order_is_larger_than_the_largest_of_the_user():
+    assert Allowed(largest=4).orders((1, 4, 6)) == [(1, 2), (4, 4)]
+    assert Allowed(largest=1).orders((1, 2)) == [(1, 1)]
+    assert Allowed(order=(6, 3), largest=4).orders((1, 2)) == [(6, 3)]
+
+
 def test_a_long_delay_of_the_user_takes_no_lags():
     # the delay is half of the fitted parts between held-out samples
     w = np.append(0.0, np.cumsum(np.random.default_rng(0).standard_normal(1999)))
