@@ -107,11 +107,11 @@ def _model(stage: Stage, rate: float, scaling: Scaling) -> StageModel:
 
 
 def _compact(H: Hysteresis) -> Hysteresis:
-    """Drop the plays without weight from H."""
+    """Drop the plays without weight from H, and a span that a file of plays does not hold."""
     if H.curves is not None or H.bias is not None:
         return H
     used = H.weights > 0.0
-    return replace(H, thresholds=H.thresholds[used], weights=H.weights[used])
+    return replace(H, thresholds=H.thresholds[used], weights=H.weights[used], span=(0.0, 1.0))
 
 
 def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
