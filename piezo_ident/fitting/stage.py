@@ -178,7 +178,8 @@ class Stage:
         T = _powers(self.law)
         return np.concatenate([c[: -len(T)], np.linalg.solve(T, c[-len(T) :])])
 
-    def _unsloped(self, values: Array) -> Array:
+    def unsloped(self, values: Array) -> Array:
+        """Replace the slopes among values of H by powers, for the coefficients of the law."""
         T = _powers(self.law)
         return np.concatenate([values[: -len(T)], T @ values[-len(T) :]])
 
@@ -254,7 +255,7 @@ class Stage:
         h, creep, poles, offsets, lags, starts = self._parts()
         lower, upper = self.bounds
         values = np.clip(values, lower, upper)
-        c, G = self._unsloped(values[h]), self.dynamics
+        c, G = self.unsloped(values[h]), self.dynamics
         if not G.is_static:
             na = G.a.size
             G = Dynamics(values[poles][:na], values[poles][na:])

@@ -133,7 +133,9 @@ def _hysteresis_result(fits: FreeRunFits) -> HysteresisFit:
         name = c.fit.stage.law.name
         errors[name] = min(float(np.sqrt(c.error)), errors.get(name, np.inf))
     H = _compact(stage.hysteresis)
-    std = law.deviations(last.covariance()[: law.size, : law.size])
+    # the fit varies slopes in place of the powers of v
+    T = stage.unsloped(np.eye(law.size))
+    std = law.deviations(T @ last.covariance()[: law.size, : law.size] @ T.T)
     used = np.isin(law.thresholds, H.thresholds)
     return HysteresisFit(
         hysteresis=H,

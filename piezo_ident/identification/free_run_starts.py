@@ -314,11 +314,9 @@ class Search:
     def _rough(self, inputs: Sequence[Array], stage: Stage | None) -> list[Fit]:
         fits = []
         for d, G in linear_starts(inputs, self.stretches, self.allowed, ROUGH).values():
-            start = (
-                Stage.linear(self.law, G, d, self.guesses)
-                if stage is None
-                else _with_dynamics(stage, d, G)
-            )
+            start = Stage.linear(self.law, G, d, self.guesses)
+            if stage is not None:
+                start = _with_dynamics(stage, d, G)
             try:
                 fits.append(self._fit(start, FEW))
             except IdentificationError:
