@@ -201,31 +201,31 @@ def _fitted_parts(runs: Sequence[Run], settings: Settings) -> tuple[list[Run], l
     Choose the widest runs, in the order of recording, and the fitted samples of each.
 
     With `hold_out` the end of each run is held out, else a few stretches spread over it.  Raises
-    IdentificationError if the widest run has too few samples to fit or to judge by.
+    IdentificationError if every run has too few samples to fit or to judge by.
     """
     ranked = sorted(runs, key=lambda r: (round(float(np.ptp(r.u)), 2), r.piece.n), reverse=True)
     masks: dict[Run, Mask] = {}
-    for run in ranked[:MOST_RUNS]:
+    refusal: IdentificationError | None = None
+    for run in ranked:
         piece, rate = run.piece, run.piece.sample_rate
-        share = max(1.5, 0.2 * piece.duration)
-        held_time = settings.hold_out or min(share, 0.25 * piece.duration)
+        held_time = settings.hold_out or min(max(1.5, 0.2 * piece.duration), 0.25 * piece.duration)
         n_held = round(held_time * rate)
         n_fit = piece.n - n_held
         if n_held < MIN_HELD or n_fit < MIN_FIT:
-            if masks:
-                continue
-            raise IdentificationError(
+            refusal = refusal or IdentificationError(
                 f'{run.record}: holding out {held_time:.3g} s leaves {max(n_fit, 0)} samples to '
                 f'fit and {min(n_held, piece.n)} to judge by, where {MIN_FIT} and {MIN_HELD} are '
                 'needed; record longer, or hold out another time (--hold-out)'
             )
-        if settings.hold_out:
-            fitted = np.arange(piece.n) < n_fit
-        else:
+            continue
+        fitted = np.arange(piece.n) < n_fit
+        if not settings.hold_out:
             fitted = ~held_out_stretches(run.u, rate, n_held)
         enough = float(np.ptp(run.u[fitted])) >= MOVES and (run.use & fitted).sum() >= MIN_FIT
-        if enough or not masks:
+        if len(masks) < MOST_RUNS and (enough or not masks):
             masks[run] = fitted
+    if refusal and not masks:
+        raise refusal
     # the model takes the zero of displacement of the last run
     chosen = [run for run in runs if run in masks]
     return chosen, [masks[run] for run in chosen]

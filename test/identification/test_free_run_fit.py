@@ -10,7 +10,7 @@ from paper_stage import PAPER
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.fitting.stretch import Stretch
-from piezo_ident.identification.free_run_fit import _fitted_parts, _windows
+from piezo_ident.identification.free_run_fit import _fitted_parts, _windows, MOST_RUNS
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.identification.settings import Settings
@@ -139,6 +139,17 @@ def test_fitted_runs_keep_the_order_of_recording(sizes):
     chosen, masks = _fitted_parts(runs, Settings())
     assert [run.record for run in chosen] == ['0', '1']
     assert [mask.size for mask in masks] == [2000, 2000]
+
+
+def test_a_wide_run_that_is_too_short_does_not_stop_the_others():
+    tiny = sine(0.018, f=1.0 / 0.018)
+    chosen, _ = _fitted_parts(plain_runs(tiny, *[0.9 * sine(0.4)] * 2), Settings())
+    assert [run.record for run in chosen] == ['1', '2']
+    with pytest.raises(IdentificationError, match='0: holding out'):
+        _fitted_parts(plain_runs(tiny, tiny), Settings())
+    # only runs that are fitted count among the most
+    many = plain_runs(*[tiny] * MOST_RUNS, 0.9 * sine(0.4))
+    assert [run.record for run in _fitted_parts(many, Settings())[0]] == [str(MOST_RUNS)]
 
 
 def test_a_long_record_with_a_short_fitted_part_has_a_window():
