@@ -34,7 +34,7 @@ from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 #: The search simulates records of at most `MOST` samples as a whole.  From longer records it takes
 #: windows of at most `WINDOWED` samples together, and then lasts half a minute.  The final fits
-#: have at most `MOST_ROWS` rows
+#: have about `MOST_ROWS` rows at most
 MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
 #: number of blocks of all stretches together (taste: a fifth of the blocks is held out in turn)
 BLOCKS = 50
@@ -184,10 +184,12 @@ def _windows(stretches: Sequence[Stretch]) -> list[Stretch]:
 
 
 def _thinned(stretches: Sequence[Stretch]) -> list[Stretch]:
-    """Thin stretches to at most `MOST_ROWS` samples that count, in whole pieces of each block."""
+    """Thin stretches to about `MOST_ROWS` samples that count, in whole pieces of each block."""
     n = sum(int(s.use.sum()) for s in stretches)
-    piece, every = 200, max(1, -(-n // MOST_ROWS))
-    return [s.with_use(s.use & (np.arange(s.u.size) // piece % every == 0)) for s in stretches]
+    piece, every, golden = 200, max(1, -(-n // MOST_ROWS)), 0.5 + np.sqrt(1.25)
+    # multiples of the golden ratio choose pieces at all phases of a periodic motion
+    chosen = [np.arange(s.u.size) // piece * golden % 1.0 < 1.0 / every for s in stretches]
+    return [s.with_use(s.use & kept) for s, kept in zip(stretches, chosen, strict=True)]
 
 
 def _taus(stretches: Sequence[Stretch]) -> Array:

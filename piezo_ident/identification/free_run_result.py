@@ -122,8 +122,7 @@ def _start(stage: Stage, i: int, run: Run, model: StageModel) -> Start | Array:
 
 def _memory(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
     """Compute the play outputs at the start of a run."""
-    widest = float(stage.law.thresholds[-1])
-    return memory_of(float(run.u[0]), widest, stage.starts[i], thresholds)
+    return memory_of(run.u[0], stage.law.thresholds[-1], stage.starts[i], thresholds)
 
 
 def _hysteresis_result(fits: FreeRunFits) -> HysteresisFit:
@@ -220,8 +219,7 @@ def _warn_of_creep(fits: FreeRunFits) -> list[str]:
 def _named(run: Run, fitted: Mask) -> str:
     """Describe the fitted samples of a run."""
     held = true_runs(~fitted)
-    rate = run.piece.sample_rate
     if len(held) == 1 and held[0][1] == fitted.size:
-        return f'the first {held[0][0] / rate:.4g} s of {run.record}'
+        return f'the first {held[0][0] / run.piece.sample_rate:.4g} s of {run.record}'
     share = 100.0 * float(np.mean(~fitted))
     return f'{run.record} without {len(held)} stretches, {share:.0f} % of it, that are held out'

@@ -10,7 +10,8 @@ from paper_stage import PAPER
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.fitting.stretch import Stretch
-from piezo_ident.identification.free_run_fit import _fitted_parts, _windows, MOST_RUNS
+from piezo_ident.identification import free_run_fit
+from piezo_ident.identification.free_run_fit import _fitted_parts, _thinned, _windows, MOST_RUNS
 from piezo_ident.identification.identify import identify
 from piezo_ident.identification.prepare import runs_of
 from piezo_ident.identification.settings import Settings
@@ -159,6 +160,16 @@ def test_a_long_record_with_a_short_fitted_part_has_a_window():
     stretch = Stretch(u, u, use, np.arange(u.size) * 50 // u.size, 20_000.0)
     (window,) = _windows([stretch])
     assert window.use.sum() == 4000
+
+
+def test_thinned_rows_show_all_of_a_periodic_motion(monkeypatch):
+    # a quarter of the rows, from a motion whose period is four pieces
+    monkeypatch.setattr(free_run_fit, 'MOST_ROWS', 10_000)
+    u = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(40_000) / 800)
+    (kept,) = _thinned([Stretch(u, u, u >= 0.0, np.zeros(u.size, dtype=int), 20_000.0)])
+    phases = np.bincount(np.flatnonzero(kept.use) % 800 // 200, minlength=4)
+    assert abs(kept.use.sum() - 10_000) < 1000
+    assert phases.min() > 0.8 * phases.mean()
 
 
 def test_a_multisine_does_not_only_jump():
