@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from piezo_ident.live.predictor import LEVEL
 from piezo_ident.model.observer import HORIZON
@@ -35,21 +36,9 @@ class Declaration:
     """
     Declaration of one parameter.
 
-    Attributes
-    ----------
-    name : str
-    default : bool, int, float, str or tuple of str
-        The parameter has the type of its default.
-    description : str
-        Meaning, without the unit.
-    unit : str
-        Empty without a unit.
-    low, high : float, optional
-        Range of a number, both ends included.
-    choices : tuple of str
-        Allowed texts; any text if empty.
-    read_only : bool
-        Whether it can only be set when the node starts.
+    The parameter has the type of its `default`.  The `description` lacks the unit.  The range of a
+    number includes both ends, `low` and `high`.  Without `choices` any text is allowed.  A
+    `read_only` parameter can only be set when the node starts.
     """
 
     name: str
@@ -72,14 +61,15 @@ def _volts(name: str, default: float, text: str) -> Declaration:
     return Declaration(name, default, text, 'V', -1000.0, 1000.0)
 
 
-_RATE = Declaration(
+_at_start, _SEEDS = partial(Declaration, read_only=True), 2**31 - 1
+
+_RATE = _at_start(
     'sample_rate',
     20000.0,
     'rate of the sample clock that starts with the excitation',
     'Hz',
     1.0,
     10e6,
-    read_only=True,
 )
 _LIMITS = (
     _volts('voltage_low', 0.0, 'lowest voltage ever sent or applied'),
@@ -97,24 +87,22 @@ _LISTENERS = (
     Declaration('wait_limit', 10.0, 'longest wait for the subscribers', 's', 0.0, 3600.0),
 )
 _MODEL = Declaration('model', '', 'model file to start with; empty: wait for the topic')
-_AXES = Declaration(
+_AXES = _at_start(
     'axes',
     ('',),
     'names of further axes, each with topics voltage_<name> and so on; empty names are left out',
-    read_only=True,
 )
 _WINDOW = Declaration('window', 2.0, 'window of the live or the tracking error', 's', 0.1, 600.0)
-_AUTOSTART = Declaration('autostart', False, 'start at once', read_only=True)
+_AUTOSTART = _at_start('autostart', False, 'start at once')
 
 EXCITATION = (
     _RATE,
     Declaration('program', 'identification', 'program to play: a name, a path, or YAML text'),
-    Declaration(
+    _at_start(
         'quantity',
         'voltage',
         'topic and unit of the program: voltage in V, or reference in um',
         choices=('voltage', 'reference'),
-        read_only=True,
     ),
     _AXES,
     Declaration('in_turn', False, 'whether the axes play one after the other'),
@@ -126,27 +114,14 @@ EXCITATION = (
 )
 
 STAGE = (
-    Declaration('stage', 'paper', 'the stage to simulate: a name or a path', read_only=True),
-    Declaration(
-        'seed',
-        -1,
-        'seed of the sensor noise; -1: the seed of the stage file',
-        '1',
-        -1,
-        2**31 - 1,
-        read_only=True,
+    _at_start('stage', 'paper', 'the stage to simulate: a name or a path'),
+    _at_start(
+        'seed', -1, 'seed of the sensor noise; -1: the seed of the stage file', '1', -1, _SEEDS
     ),
     *_LIMITS,
     _SLEW,
     *_REST,
-    Declaration(
-        'silence',
-        0.5,
-        'time without a block that ends a stream',
-        's',
-        0.01,
-        3600.0,
-    ),
+    Declaration('silence', 0.5, 'time without a block that ends a stream', 's', 0.01, 3600.0),
 )
 
 IDENTIFIER = (
@@ -161,7 +136,7 @@ IDENTIFIER = (
     Declaration('polish', False, 'whether least squares refine the result of the swarm'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
     Declaration('delay', -1, 'delay of the model; -1: identified', 'samples', -1, 10_000),
-    Declaration('seed', 0, 'seed of all random draws', '1', 0, 2**31 - 1),
+    Declaration('seed', 0, 'seed of all random draws', '1', 0, _SEEDS),
     Declaration('swarm_size', 40, 'number of particles', '1', 2, 10_000),
     Declaration('swarm_iterations', 20_000, 'most iterations of the swarm', '1', 1, 10_000_000),
     Declaration('output', '', 'folder into which ~/save writes; empty: none'),
@@ -179,16 +154,13 @@ IDENTIFIER = (
     Declaration('holds_program', 'holds', 'program of ~/diagnose for holds after steps'),
     Declaration('requests', 2, 'most programs that one ~/diagnose asks for', '1', 0, 10),
     _AXES,
-    Declaration(
+    _at_start(
         'channels',
         ('',),
         'topics of further axes (voltage_<name>, displacement_<name>) and channels (layout '
         't,x_<name>); empty names are left out',
-        read_only=True,
     ),
-    Declaration(
-        'nice', 5, 'niceness of the process that does the work', '1', 0, 19, read_only=True
-    ),
+    _at_start('nice', 5, 'niceness of the process that does the work', '1', 0, 19),
 )
 
 MODEL = (
@@ -203,14 +175,8 @@ MODEL = (
         1000.0,
     ),
     _WINDOW,
-    Declaration(
-        'preview_rate',
-        50.0,
-        'rate of the preview, and of the corrections',
-        'Hz',
-        1.0,
-        200.0,
-        read_only=True,
+    _at_start(
+        'preview_rate', 50.0, 'rate of the preview, and of the corrections', 'Hz', 1.0, 200.0
     ),
     Declaration(
         'horizon',
@@ -229,38 +195,24 @@ MODEL = (
         choices=('off', 'gain', 'hysteresis'),
     ),
     Declaration('output', '', 'file into which ~/save writes the learnt model; empty: none'),
-    Declaration(
-        'interval',
-        LEVEL,
-        'share of the errors that the band holds',
-        '1',
-        0.01,
-        0.999,
-        read_only=True,
-    ),
+    _at_start('interval', LEVEL, 'share of the errors that the band holds', '1', 0.01, 0.999),
 )
 
 RECORDER = (
     Declaration('output', 'recording', 'bag to write; a number is added when it is there'),
-    Declaration(
-        'storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3'), read_only=True
-    ),
-    Declaration(
+    _at_start('storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3')),
+    _at_start(
         'topics',
         (
             *SAMPLE_TOPICS,
             *LATCHED_TOPICS,
             'preview',
             'corrections',
-            'excitation/status',
-            'stage/status',
-            'identifier/status',
-            'model/status',
+            *(f'{node}/status' for node in ('excitation', 'stage', 'identifier', 'model')),
             'feedforward/status',
             '/diagnostics',
         ),
         'topics to record',
-        read_only=True,
     ),
     _AXES,
     Declaration(
@@ -293,15 +245,7 @@ FEEDFORWARD = (
     _RATE,
     _MODEL,
     _AXES,
-    Declaration(
-        'preview',
-        0.02,
-        'delay of the stage behind the reference',
-        's',
-        1e-5,
-        10.0,
-        read_only=True,
-    ),
+    _at_start('preview', 0.02, 'delay of the stage behind the reference', 's', 1e-5, 10.0),
     *_LIMITS,
     _SLEW,
     *_REST,

@@ -28,8 +28,8 @@ from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.parameters import with_axes
-from piezo_ident.nodes.subscriptions import message_class, qos_of, topics_problem
-from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.nodes.subscriptions import message_class, topics_problem
+from piezo_ident.nodes.wire import LATCHED, qos_of, STREAM
 from piezo_ident.record.bags.read import (
     blocks_in,
     carried_quantities,

@@ -20,14 +20,14 @@ from typing import Any
 from piezo_ident.common.errors import PiezoIdentError
 from piezo_ident.live.pacing import ArrivalClock
 from piezo_ident.nodes.parameters import LATCHED_TOPICS, SAMPLE_TOPICS
-from piezo_ident.nodes.wire import LATCHED, STREAM
+from piezo_ident.nodes.wire import LATCHED, qos_of, STREAM
 from piezo_ident.record.bags.write import knows_type, SAMPLE_QOS
 from piezo_ident.record.channels import channel_of_quantity, role_of
 from piezo_ident.record.stream import LossCount
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.validate_topic_name import validate_topic_name
 from rosbags.interfaces import Qos, QosDurability, QosReliability
@@ -86,24 +86,13 @@ def topics_problem(names: Sequence[str], parameter: str = 'topics') -> str | Non
     return None
 
 
-def qos_of(
-    *, reliable: bool = True, latched: bool = False, depth: int = STREAM.depth
-) -> QoSProfile:
-    """Make a QoS that keeps the last messages."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
 def unspun(
-    node: Node, kind: Any, topic: str, profile: QoSProfile | None = None, *, raw: bool = False
+    node: Node, kind: Any, topic: str, profile: QoSProfile = STREAM, *, raw: bool = False
 ) -> Subscription:
     """Subscribe without the executor: the caller takes the messages."""
-    group, profile = _NotSpun(), profile or qos_of()
-    return node.create_subscription(kind, topic, _ignore, profile, callback_group=group, raw=raw)
+    return node.create_subscription(
+        kind, topic, lambda _: None, profile, callback_group=_NotSpun(), raw=raw
+    )
 
 
 class BlockSubscriptions:
@@ -322,10 +311,6 @@ class RawSubscriptions:
         infos = self._node.get_publishers_info_by_topic(name)
         offers = [_offer(i.qos_profile) for i in infos] or [_offer(request.profile())]
         return request.type, [o for i, o in enumerate(offers) if o not in offers[:i]]
-
-
-def _ignore(_: object) -> None:
-    """Do nothing: `drain` or `arrived` take the messages."""
 
 
 def _offer(profile: QoSProfile) -> Qos:

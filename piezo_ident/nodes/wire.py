@@ -19,30 +19,26 @@ MOST, LONGEST = 100_000, 200
 #: name for a node that the middleware has not discovered yet
 UNNAMED = 'a node without a name'
 
+
+def qos_of(*, reliable: bool = True, latched: bool = False, depth: int = 1000) -> QoSProfile:
+    """Make a QoS that keeps the last messages."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
 #: samples: reliable, with the last five seconds of blocks on both sides, so that a reader that
 #: stops for a moment loses no block
-STREAM = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+STREAM = qos_of()
 #: messages that a late node must still receive: model, report, status
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+LATCHED = qos_of(latched=True, depth=1)
 #: messages for people, and diagnostics
 PREVIEW = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
 #: services: responses go to all clients; with the default depth of 10 a slow client loses its own
-SERVICE = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
+SERVICE = STREAM
 
 
 def to_message(samples: Samples) -> Float64MultiArray:
