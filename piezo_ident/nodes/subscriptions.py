@@ -10,7 +10,7 @@ itself in a fifth of this time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import importlib
 import threading
@@ -95,45 +95,14 @@ def unspun(
     )
 
 
-class BlockSubscriptions:
-    """
-    Subscriptions to topics of blocks, emptied by `drain`.
-
-    Parameters
-    ----------
-    node : Node
-    take : callable
-        Gets the topic, the key of `add`, the message, and the information of the middleware.
-    """
-
-    def __init__(
-        self, node: Node, take: Callable[[str, str, Float64MultiArray, Mapping[str, Any]], None]
-    ) -> None:
-        self._node, self._take = node, take
-        self._subscriptions: dict[str, tuple[str, Any]] = {}
-
-    def add(self, topic: str, key: str) -> None:
-        """Subscribe to one more topic."""
-        self._subscriptions[topic] = (key, unspun(self._node, Float64MultiArray, topic))
-
-    @property
-    def unpublished(self) -> list[str]:
-        """Keys of the topics without a publisher."""
-        return [
-            key or topic
-            for topic, (key, subscription) in self._subscriptions.items()
-            if not subscription.get_publisher_count()
-        ]
-
-    def drain(self) -> None:
-        """Hand over all received messages."""
-        for topic, (key, subscription) in self._subscriptions.items():
-            # one queue at most, or a flood on one topic starves the others
-            for _ in range(STREAM.depth):
-                message = subscription.handle.take_message(Float64MultiArray, False)
-                if message is None:
-                    break
-                self._take(topic, key, *message)
+def received(subscription: Any, *, raw: bool) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """Take the messages of a subscription that the caller empties, with their information."""
+    # one queue at most, or a flood on one topic starves the others
+    for _ in range(STREAM.depth):
+        message = subscription.handle.take_message(subscription.msg_type, raw)
+        if message is None:
+            return
+        yield message
 
 
 @dataclass(frozen=True)
@@ -287,13 +256,7 @@ class RawSubscriptions:
             for topic in self._topics.values():
                 if topic.subscription is None:
                     continue
-                handle, kind = topic.subscription.handle, topic.subscription.msg_type
-                # one queue at most, or a flood on one topic starves the others
-                for _ in range(STREAM.depth):
-                    message = handle.take_message(kind, True)
-                    if message is None:
-                        break
-                    raw, info = message
+                for raw, info in received(topic.subscription, raw=True):
                     topic.taken += 1
                     number = info['publication_sequence_number'] or 0
                     topic.note(number)

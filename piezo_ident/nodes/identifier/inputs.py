@@ -13,7 +13,7 @@ from typing import Any
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.capture import Capture
 from piezo_ident.nodes.identifier.excitation_client import Streams
-from piezo_ident.nodes.subscriptions import BlockSubscriptions
+from piezo_ident.nodes.subscriptions import received, unspun
 from piezo_ident.nodes.wire import from_message
 from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantity
 from rclpy.node import Node
@@ -34,18 +34,19 @@ class Inputs:
         self.passed: Counter[str] = Counter()
         self._capture = capture
         self._held: deque[tuple[str, str, Float64MultiArray, Mapping[str, Any]]] = deque()
-        self._subscriptions = BlockSubscriptions(node, lambda *block: self._held.append(block))
-        for key in ('voltage', 'displacement', APPLIED):
-            self._subscriptions.add(key, key)
+        keys = {key: key for key in ('voltage', 'displacement', APPLIED)}
         for topic in channels:
-            self._subscriptions.add(topic, '')
+            keys[topic] = ''
             home, _, base = topic.rpartition('/')
             if applied := applied_key(base):
-                self._subscriptions.add(f'{home}/{applied}' if home else applied, applied)
+                keys[f'{home}/{applied}' if home else applied] = applied
+        # key and subscription of each topic
+        self._topics = {t: (key, unspun(node, Float64MultiArray, t)) for t, key in keys.items()}
 
     def drain(self, *, hold: bool) -> None:
         """Capture the received blocks, or keep them for later."""
-        self._subscriptions.drain()
+        for topic, (key, subscription) in self._topics.items():
+            self._held += ((topic, key, *block) for block in received(subscription, raw=False))
         while self._held and not hold:
             self._take(*self._held.popleft())
 
@@ -81,6 +82,7 @@ class Inputs:
     @property
     def unpublished(self) -> str:
         """Topics without a matched publisher, whose messages would be lost."""
-        topics = self._subscriptions.unpublished
+        unmatched = (x for x in self._topics.items() if not x[1][1].get_publisher_count())
+        topics = [key or topic for topic, (key, _) in unmatched]
         driven = ('voltage', APPLIED)
         return ', '.join(t for t in topics if not t.rpartition('/')[2].startswith(driven))
