@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 import functools
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
-from piezo_ident.common.process import Tick
 from piezo_ident.diagnosis import Diagnosis, DiagnosisSettings
 from piezo_ident.diagnosis.next_experiment import Experiment, Kind, next_experiment
 from piezo_ident.live.capture import Capture
@@ -18,26 +17,8 @@ from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.nodes.identifier.jobs import diagnose_capture, DiagnosisOutcome
 
-
-class Host(Protocol):
-    """Services of the node to a session."""
-
-    values: dict[str, Any]
-
-    def can_excite(self) -> bool:
-        """Return whether an excitation and a stage are present."""
-
-    def excite(self, program: str, why: str, ended: Callable[[str | None], None]) -> None:
-        """Play a program; `ended` gets None for a complete capture, else the reason."""
-
-    def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
-        """Start a job; `DiagnosisSession.take_outcome` gets its result."""
-
-    def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
-        """Publish the last outcome, with notes on open questions."""
-
-    def fail(self, reason: str) -> None:
-        """Report why the diagnosis failed."""
+if TYPE_CHECKING:
+    from piezo_ident.nodes.identifier.node import IdentifierNode
 
 
 class DiagnosisSession:
@@ -47,7 +28,7 @@ class DiagnosisSession:
     Each diagnosis begins with the same `model`; `diagnosis` is the last result.
     """
 
-    def __init__(self, host: Host, capture: Capture) -> None:
+    def __init__(self, host: IdentifierNode, capture: Capture) -> None:
         self._host, self._capture = host, capture
         self.model: StageModel | MultiAxisModel | None = None
         self.diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None

@@ -278,19 +278,19 @@ class IdentifierNode(LabNode):
         ended: Callable[[str | None], None],
         begin: Callable[[], None] | None = None,
     ) -> None:
-        """Play a program of the excitation."""
+        """Play a program; `ended` gets None for a complete capture, else the reason."""
         self._task = why
         self._excitation.start(program, self.values['excitation_limit'], ended, begin)
         self._set_state('exciting', 0.0, why)
 
     def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
-        """Start a job of the worker."""
+        """Start a job; `DiagnosisSession.take_outcome` gets its result."""
         self._task = 'diagnosis'
         self._set_state('diagnosing', 0.0, f'the model is tested on {seconds:.3g} s')
         self._start(job)
 
     def conclude(self, outcome: DiagnosisOutcome, notes: tuple[str, ...]) -> None:
-        """Publish report, model and verdict."""
+        """Publish report, model and verdict, with notes on open questions."""
         self._report.publish(String(data=outcome.report))
         if outcome.model != (self._published or outcome.judged):
             self._publish_model(outcome.model)
