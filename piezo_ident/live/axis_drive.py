@@ -27,20 +27,15 @@ from piezo_ident.live.history import History
 from piezo_ident.live.join import held
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
-from piezo_ident.record.blocks import Samples
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    Voltage for a block of a reference; several axes have a row each.
+    Voltage `v` [V] for a block of a reference, and the `wanted` displacement at the times `t` [s].
 
-    Attributes
-    ----------
-    t, v, wanted : ndarray, shape (n,)
-        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
-    clipped : int
-        Number of samples at which a limit keeps the stage from the wanted displacement.
+    Several axes have a row each.  `clipped` counts the samples at which a limit keeps the stage
+    from the wanted displacement [m].
     """
 
     t: Array
@@ -67,10 +62,9 @@ def check_rate(model: StageModel, settings: GuardSettings) -> None:
         )
 
 
-def inverse_of(model: StageModel, settings: GuardSettings, preview: int) -> LiveInverse:
+def inverse_of(model: StageModel, s: GuardSettings, preview: int) -> LiveInverse:
     """Invert the model of an axis within the limits."""
-    check_rate(model, settings)
-    s = settings
+    check_rate(model, s)
     return LiveInverse(model, limits=(s.low, s.high), slew=s.slew, preview=preview, rest=s.rest)
 
 
@@ -78,15 +72,8 @@ class AxisDrive:
     """
     Drives one axis by the voltage of an inverse; parameters and errors as for `Tracker`.
 
-    Parameters
-    ----------
-    start : float
-        Displacement at rest [m].
-
-    Attributes
-    ----------
-    follower : Follower or None
-        Corrects the goal by the measured error; None if `follow` is ``'off'``.
+    The axis begins at rest at the displacement `start` [m].  Its `follower` corrects the goal by
+    the measured error; it is None if `follow` is ``'off'``.
     """
 
     def __init__(
@@ -101,8 +88,8 @@ class AxisDrive:
         """Begin at rest at a displacement [m], with the clock of the voltage at zero."""
         self._guard, self._past = Guard(self._settings), History()
         self._start = start
-        self._raw = self._wanted = np.full(self._preview, self._start)
-        self._join = _Join(self._start, self._step())
+        self._raw = self._wanted = np.full(self._preview, start)
+        self._join = _Join(start, self._step())
         self.follower = self._new_follower()
 
     def _new_follower(self, stream: Stream | None = None) -> Follower | None:
@@ -110,8 +97,8 @@ class AxisDrive:
             return None
         before = None if stream is None else self.follower
         known = before is not None and before.corrector.knows_memory
-        gain, model = self._follow == 'gain', self._model
-        return Follower(model, gain, self._step(), (stream or model.stream(), self.tick), known)
+        run, gain = stream or self._model.stream(), self._follow == 'gain'
+        return Follower(self._model, gain, self._step(), run, self.tick, known)
 
     @property
     def last_reference(self) -> float:
@@ -150,42 +137,37 @@ class AxisDrive:
 
     def drive(self, v: Array, clipped: Mask) -> Drive:
         """Send the next voltage [V] of the inverse, with the mask of its clipped samples."""
-        v = self._guard.process(v).voltage
+        t, v = self.play(v)
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
         # an axis that nobody moves has no reference that could be out of reach
         missed = int(np.count_nonzero(clipped & (now != self._start)))
-        return Drive(self._sent(v), v, now, missed)
-
-    def measured(self, samples: Samples) -> None:
-        """Take a block of displacement [m], on the clock of the voltage."""
-        if self.follower is not None:
-            self.follower.measured(samples)
+        return Drive(t, v, now, missed)
 
     def play(self, v: Array) -> tuple[Array, Array]:
         """Send a given voltage, joined softly and limited; return its time and voltage."""
-        v = self._guard.process(v).voltage
-        return self._sent(v), v
+        return self._sent(self._guard.process(v).voltage)
 
     def idle(self, n: int, longest: float) -> tuple[Array, Array]:
         """Send n samples of a ramp to rest; return time and voltage.  See `Guard.idle`."""
-        v = self._guard.idle(n, longest)
-        return self._sent(v), v
+        return self._sent(self._guard.idle(n, longest))
 
     def hurry(self) -> None:
         """Begin a ramp to rest anew, so that `idle` can shorten it."""
         self._guard = Guard(self._settings, self._guard.applied)
 
-    def _sent(self, v: Array) -> Array:
+    def _sent(self, v: Array) -> tuple[Array, Array]:
         t = np.arange(self.tick, self.tick + v.size) / self._settings.sample_rate
         if v.size:
             with self._lock:
                 self._past.add(t, v)
-        return t
+        return t, v
 
     # another model
 
-    def successor(self, model: StageModel, past: History) -> Successor:
-        """Bring a model into the state after a `past`; any thread may call this."""
+    def successor(self, model: StageModel) -> Successor:
+        """Bring a model into the state after the voltage so far; any thread may call this."""
+        with self._lock:
+            past = self._past.snapshot()
         inverse, run = inverse_of(model, self._settings, self._preview), None
         if past:
             period = 1.0 / self._settings.sample_rate
@@ -195,11 +177,6 @@ class AxisDrive:
                 run = inverse.model.stream()
                 run.process(*past.recall(run, inverse.model, period)[::-1])
         return Successor(inverse, past.count, run)
-
-    def past(self) -> History:
-        """Return a snapshot of the voltage so far; any thread may call this."""
-        with self._lock:
-            return self._past.snapshot()
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
@@ -224,22 +201,11 @@ class AxisDrive:
 
 class _Join:
     """
-    Joins a reference along a raised cosine.
+    Joins a reference along a raised cosine, from the position `start` of the stage [m].
 
-    Parameters
-    ----------
-    start : float
-        Position of the stage [m].
-    step : float
-        Largest change by the cosine from one sample to the next [m].
-    moves : bool, optional
-        Whether the stage already moves along the reference.  The distance between them then fades
-        out.  From rest the reference fades in instead, so the sum never leaves the range of both.
-
-    Attributes
-    ----------
-    last : float
-        The last sample [m].
+    The cosine changes by at most `step` from one sample to the next [m].  If the stage already
+    moves along the reference, the distance between them fades out.  From rest the reference fades
+    in instead, so the sum never leaves the range of both.  `last` is the last sample [m].
     """
 
     def __init__(self, start: float, step: float, moves: bool = False) -> None:

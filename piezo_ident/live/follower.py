@@ -49,25 +49,11 @@ class _Known(NamedTuple):
 
 class Follower:
     """
-    Corrects a wanted motion by the measured error of the stage.
+    Corrects a wanted motion by the measured error of the stage, with or without the `gain`.
 
-    Parameters
-    ----------
-    model : StageModel
-    gain : bool
-        Whether the gain is corrected, too.
-    step : float
-        Largest change of the correction from one sample to the next [m].
-    run : tuple of Stream and int, optional
-        A run of the model up to now, and the next tick of the voltage; at rest when absent.
-    known : bool, optional
-        Whether that run has the memory of the plays.
-
-    Attributes
-    ----------
-    corrector : Corrector
-    is_limited : bool
-        Whether the last correction was as large as it may be.
+    The correction changes by at most `step` from one sample to the next [m].  The `stream` has run
+    the model up to the `tick` of the next voltage; it is `known` to have the memory of the plays.
+    `is_limited` says whether the last correction was as large as it may be.
     """
 
     def __init__(
@@ -75,12 +61,13 @@ class Follower:
         model: StageModel,
         gain: bool,
         step: float,
-        run: tuple[Stream, int] | None = None,
-        known: bool = False,
+        stream: Stream,
+        tick: int,
+        known: bool,
     ) -> None:
         self.corrector, self._model, self._known = Corrector(gain=gain), model, known
         self.corrector.set_model(model)
-        self._stream, self._next = run or (model.stream(), 0)
+        self._stream, self._next = stream, tick
         rate = model.sample_rate
         self._knot, self._late = (max(1, round(time * rate)) for time in (KNOT, LATE))
         self._left = np.exp(-1.0 / (rate * creep_elements(model)[1]))

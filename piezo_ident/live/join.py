@@ -45,12 +45,7 @@ def held(x: Array, before: float) -> Array:
 
 class Companion:
     """
-    Samples of one topic, by tick.
-
-    Parameters
-    ----------
-    sample_rate : float
-        [Hz]
+    Samples of one topic, by the tick of a clock of `sample_rate` [Hz].
 
     Examples
     --------
@@ -95,14 +90,9 @@ class Join:
     """
     Blocks of the first axis, each of which waits for the other axes at the same times.
 
-    Parameters
-    ----------
-    tails : sequence of str
-        Ends of the topics of the further axes, such as ``_b``.
-    sample_rate : float, optional
-        Rate of the clock of the stream, or a higher rate [Hz].
-    rest : sequence of float, optional
-        Values of the further axes before their first sample.  Default: zero.
+    The topics of the further axes end in `tails`, such as ``_b``.  Before their first sample these
+    axes have the values `rest`, or zero.  The clock of the stream has the `sample_rate` [Hz] or a
+    lower one.
 
     Examples
     --------

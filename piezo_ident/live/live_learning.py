@@ -110,16 +110,8 @@ class Learner:
     """
     Plays the repetitions that a `LiveLearning` plans, at `most` so many.
 
-    A thread calls `make` for the plan.  `play` gets a block of voltage and one of wanted
-    displacement.
-
-    Attributes
-    ----------
-    learning : LiveLearning or None
-        None until it is made.
-    text : str
-        Progress, for people.
-    is_over : bool
+    A thread calls `make` for the plan `learning`, which is None before.  `play` gets a block of
+    voltage and one of wanted displacement.  `text` tells the progress to people.
     """
 
     def __init__(

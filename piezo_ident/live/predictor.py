@@ -50,18 +50,8 @@ class AxesRun:
     Run of a model, with a row of voltages and of displacements for each axis.
 
     A coupled axis runs twice: alone, for the motion by its own voltage, and with the motions of
-    the other axes.
-
-    Parameters
-    ----------
-    model : StageModel or MultiAxisModel
-    axes : sequence of str
-        Order of the rows, by the names of the displacements; all axes of the model.
-
-    Attributes
-    ----------
-    felt : ndarray, shape (k, n)
-        Motion by other axes in the last displacements [m].
+    the other axes.  `axes` gives the order of the rows, by the names of all displacements.  `felt`
+    is the motion by other axes in the last displacements [m], shape (k, n).
 
     Examples
     --------
@@ -125,23 +115,12 @@ def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
 
 class Predictor:
     """
-    Predicts the displacement as blocks of voltage come.
+    Predicts the displacement as blocks of voltage come, with a row for each of several `axes`.
 
-    Parameters
-    ----------
-    axes : sequence of str, optional
-        Names of the displacements; blocks of several axes have a row for each.
-    level : float, optional
-        Share of the errors that the band holds.
-
-    Attributes
-    ----------
-    problem : str
-        The last problem of the stream; empty without one.
-    half_width : Samples or None
-        Half width of the band of the last block [m]; None if the model carries no band.
-    felt : ndarray, shape (k, n)
-        Motion by other axes in the last prediction [m].
+    `problem` is the last problem of the stream; empty without one.  `clock` counts lost and late
+    samples, and restarts.  `half_width` is that of the band of the last block [m], which holds the
+    share `level` of the errors; None if the model carries no band.  `felt` is the motion by other
+    axes in the last prediction [m], shape (k, n).
     """
 
     def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:
@@ -151,7 +130,7 @@ class Predictor:
         self.half_width: Samples | None = None
         self.felt = np.zeros((len(self._axes), 0))
         self._level = level
-        self._clock = BlockClock()
+        self.clock = BlockClock()
         self._clear()
 
     def _clear(self) -> None:
@@ -159,21 +138,6 @@ class Predictor:
         self._run: AxesRun | ModesRun | None = None
         self._bands = list[BandStream]()
         self._lowest = [float('inf')] * len(self._axes)
-
-    @property
-    def lost(self) -> int:
-        """Number of missing or unusable samples."""
-        return self._clock.lost
-
-    @property
-    def late(self) -> int:
-        """Number of samples that were left out as repeated or late."""
-        return self._clock.late
-
-    @property
-    def restarts(self) -> int:
-        """Number of restarts of the sample clock."""
-        return self._clock.restarts
 
     @property
     def memory_known(self) -> bool:
@@ -194,11 +158,6 @@ class Predictor:
             each[a].scaling.u(v) < REST for a, v in zip(self._axes, self._lowest, strict=True)
         )
 
-    @property
-    def memory_lost(self) -> bool:
-        """Whether blocks arrive and the memory of the plays is not known."""
-        return bool(np.isfinite(self._clock.last)) and not self.memory_known
-
     def set_model(self, model: StageModel | MultiAxisModel) -> None:
         """
         Take a model, in the state that it would have if it had run from the start.
@@ -208,24 +167,24 @@ class Predictor:
         """
         check_axes(model, self._axes)
         require_voltages_only(model)
-        if np.isfinite(self._clock.period):
+        if np.isfinite(self.clock.period):
             self._check_rate(model)
         for one in _with_band(model, self._axes):
             band_of(one)  # a damaged band is refused now, not in the stream
         run = None
         if self._pasts[0]:
             run = run_of(model, self._axes)
-            run.recall(self._pasts, self._clock.period)
+            run.recall(self._pasts, self.clock.period)
         self.model, self._run, self._bands = model, run, []
         if self._pasts[0] and self.problem.startswith('the stream'):
             self.problem = ''
 
     def _check_rate(self, model: StageModel | MultiAxisModel) -> None:
         is_static = all(x.is_static for x in models_of(model).values())
-        if is_static or abs(self._clock.period * model.sample_rate - 1.0) < 1e-6:
+        if is_static or abs(self.clock.period * model.sample_rate - 1.0) < 1e-6:
             return
         raise ModelError(
-            f'the stream is sampled at {1.0 / self._clock.period:.6g} Hz, the model holds for '
+            f'the stream is sampled at {1.0 / self.clock.period:.6g} Hz, the model holds for '
             f'{model.sample_rate:g} Hz; identify a model at the rate of the stream'
         )
 
@@ -234,7 +193,7 @@ class Predictor:
         stream, past = model.stream(), self._pasts[axis]
         if not past:
             return stream
-        t, v = past.recall(stream, model, self._clock.period)
+        t, v = past.recall(stream, model, self.clock.period)
         stream.process(v, t)
         return stream
 
@@ -252,7 +211,7 @@ class Predictor:
         t, v = np.array(samples.t, np.float64), np.array(samples.values, np.float64, ndmin=2)
         if not self._usable(t, v):
             return None
-        clock = self._clock
+        clock = self.clock
         before, last = clock.period, clock.last
         kind, count = clock.judge(t)
         if kind is Kind.LATE:
@@ -303,7 +262,7 @@ class Predictor:
                 f'the block of voltage at t = {t[0]:.6g} s holds NaN or infinite numbers; '
                 'it is left out'
             )
-        elif t.size == 1 and np.isnan(self._clock.period):
+        elif t.size == 1 and np.isnan(self.clock.period):
             self.problem = (
                 f'the block at t = {t[0]:.6g} s is one sample, which tells no sampling rate; it '
                 'is left out'
@@ -314,7 +273,7 @@ class Predictor:
 
     def _bridge(self, t0: float, t1: float, v1: Array, missing: int) -> None:
         self.problem = f'{missing} samples of voltage are missing before t = {t1:.6g} s'
-        if missing * self._clock.period > BRIDGE:
+        if missing * self.clock.period > BRIDGE:
             self._clear()
             return
         now = [past.last for past in self._pasts]

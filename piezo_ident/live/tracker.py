@@ -24,7 +24,6 @@ from piezo_ident.control.live_inverse import PREVIEW
 from piezo_ident.live.axis_drive import AxisDrive, check_rate, Drive, inverse_of, Successor
 from piezo_ident.live.follower import Follower
 from piezo_ident.live.guard import GuardSettings
-from piezo_ident.live.history import History
 from piezo_ident.live.predictor import check_axes
 from piezo_ident.model.multi_axis import alone, models_of, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel
@@ -33,27 +32,14 @@ from piezo_ident.record.blocks import Samples
 
 class Tracker:
     """
-    Follows the reference of a stage with a model.
+    Follows the reference of a stage with a model, `preview` samples later.
 
-    The stage is at rest before the first block.  Arrays of several axes have a row for each axis.
+    The stage is at rest before the first block.  Arrays of several axes have a row for each of
+    `axes`, the names of the displacements.  The `settings` hold for each axis, at the rate of the
+    model.  An axis without an inverse within these limits raises the errors of `LiveInverse`.
 
-    Parameters
-    ----------
-    model : StageModel or MultiAxisModel
-    settings : GuardSettings
-        Limits and slew of each axis, at the rate of the model.
-    preview : int, optional
-        Samples by which the stage follows the reference later.
-    follow : {'off', 'offset', 'gain'}, optional
-        Corrections of each axis by its measured displacement: none, offset and creep from earlier
-        motion, or these and the gain of the axis.
-    axes : sequence of str, optional
-        Order of the rows, by the names of the displacements.
-
-    Raises
-    ------
-    DataError, ModelError
-        When an axis has no inverse within these limits; see `LiveInverse`.
+    `follow` chooses the corrections of each axis by its measured displacement: none (``'off'``),
+    offset and creep from earlier motion (``'offset'``), or these and the gain (``'gain'``).
 
     Examples
     --------
@@ -74,15 +60,13 @@ class Tracker:
         follow: str = 'off',
         axes: Sequence[str] = ('y',),
     ) -> None:
-        self.settings, self.preview, self.follow = settings, preview, follow
+        self.settings, self.preview, self.follow, s = settings, preview, follow, settings
         single = [alone(model)[axis] for axis in axes]
         self._inverse: LiveChains | LiveModesInverse
         if isinstance(model, MultiAxisModel) and model.modes is not None:
-            s = settings
             check_rate(single[0], s)
-            limits = (s.low, s.high)
             self._inverse = LiveModesInverse(
-                model, axes, limits=limits, slew=s.slew, preview=preview, rest=s.rest
+                model, axes, limits=(s.low, s.high), slew=s.slew, preview=preview, rest=s.rest
             )
         else:
             each = [inverse_of(x, settings, preview) for x in single]
@@ -131,21 +115,10 @@ class Tracker:
 
     def process(self, reference: ArrayLike, restarted: bool = False) -> Drive:
         """
-        Make the voltage for the next samples of a reference.
+        Make the voltage for the next samples of a reference [m], shape (n,), or (k, n) for k axes.
 
-        A sample that is NaN or infinite repeats the last sample.
-
-        Parameters
-        ----------
-        reference : array_like, shape (n,), or (k, n) for k axes
-            [m]
-        restarted : bool, optional
-            Whether a new stream begins here, which has to be joined.
-
-        Returns
-        -------
-        Drive
-            As many samples of voltage; each belongs to the reference `preview` samples before.
+        Each sample of voltage belongs to the reference `preview` samples before.  A sample that is
+        NaN or infinite repeats the last sample.  A stream that was `restarted` has to be joined.
         """
         each = self._each
         rows = zip(each, np.atleast_2d(reference), strict=True)
@@ -169,7 +142,8 @@ class Tracker:
 
     def measured(self, samples: Samples, axis: int = 0) -> None:
         """Take a block of displacement of an axis [m], on the clock of the voltage."""
-        self._each[axis].measured(samples)
+        if (follower := self._each[axis].follower) is not None:
+            follower.measured(samples)
 
     def finish(self) -> Drive:
         """Make the voltage for the rest of the reference, whose last sample is repeated."""
@@ -196,13 +170,9 @@ class Tracker:
 
     # another model of a single axis
 
-    def past(self) -> History:
-        """Return a snapshot of the voltage so far; any thread may call this."""
-        return self._each[0].past()
-
-    def successor(self, model: StageModel, past: History) -> Successor:
-        """Bring a model into the state after a `past`; any thread may call this."""
-        return self._each[0].successor(model, past)
+    def successor(self, model: StageModel) -> Successor:
+        """Bring a model into the state after the voltage so far; any thread may call this."""
+        return self._each[0].successor(model)
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
@@ -232,12 +202,7 @@ def prepared(
     Prepare another model for the axes of a node; any thread may call this.
 
     A model of one axis becomes the successor of the tracker at work, `now`, if that one has the
-    same settings.
-
-    Raises
-    ------
-    ModelError
-        When the model has other axes.
+    same settings.  ModelError when the model has other axes.
     """
     check_axes(model, axes)
     if not axes[1:]:
@@ -245,7 +210,7 @@ def prepared(
             model.require_chains('feedforward of one axis')
         (model,) = models_of(model).values()
         if now is not None and (now.settings, now.follow) == (settings, follow):
-            return model, now.successor(model, now.past())
+            return model, now.successor(model)
     return model, Tracker(model, settings, preview, follow, axes)
 
 

@@ -236,7 +236,7 @@ class ModelNode(LabNode):
     def _is_lost(self) -> bool:
         """Whether blocks arrive and the memory of the plays is not known."""
         known = all(one.is_known for one in self._comparisons.values())
-        return self._predictor.memory_lost and not known
+        return bool(np.isfinite(self._predictor.clock.last)) and not known
 
     def _publish(self, topic: str, samples: Samples) -> None:
         self._quantities[topic].publish(to_message(samples))
@@ -305,9 +305,9 @@ class ModelNode(LabNode):
         values: dict[str, object] = {
             'rate': f'{self._count / elapsed:.0f}',
             'load': f'{100.0 * self._work / elapsed:.1f}',
-            'lost': p.lost,
-            'late': p.late,
-            'restarts': p.restarts,
+            'lost': p.clock.lost,
+            'late': p.clock.late,
+            'restarts': p.clock.restarts,
             'unreadable': self._unreadable,
             'not_finite': self._not_finite,
             'unmatched': sum(one.matcher.unmatched for one in each.values()),

@@ -100,7 +100,7 @@ def test_prediction_is_that_of_the_whole_piece_bit_for_bit():
     assert (first.segment, first.quantity) == ('noise', 'displacement')
     made = np.concatenate([first.values, predicted(predictor, blocks[1:])])
     np.testing.assert_array_equal(made, m.predict_piece(Piece(v, np.zeros_like(v), RATE)))
-    assert predictor.problem == '' and predictor.lost == predictor.late == 0
+    assert predictor.problem == '' and predictor.clock.lost == predictor.clock.late == 0
     assert predictor.memory_known
 
 
@@ -177,7 +177,7 @@ def test_a_restart_begins_anew():
     blocks = cut(v)
     first = predicted(predictor, blocks)
     np.testing.assert_array_equal(predicted(predictor, blocks), first)
-    assert predictor.restarts == 1 and predictor.late == 0
+    assert predictor.clock.restarts == 1 and predictor.clock.late == 0
 
 
 def test_a_lost_block_is_bridged_and_counted():
@@ -185,7 +185,7 @@ def test_a_lost_block_is_bridged_and_counted():
     predictor = running(m)
     blocks = cut(v)
     made = predicted(predictor, blocks[:25] + blocks[26:])
-    assert predictor.lost == 100
+    assert predictor.clock.lost == 100
     assert '100 samples of voltage are missing before t = 0.26 s' in predictor.problem
     whole = m.predict_piece(Piece(v, v, RATE))
     # a straight line is close to 10 ms of a slow sine, and behind it nothing is left of the gap
@@ -211,7 +211,7 @@ def test_a_long_gap_is_another_run():
     made = predicted(predictor, blocks[150:])
     alone = m.predict_piece(Piece(v[15_000:], v[15_000:], RATE, start_time=1.5))
     np.testing.assert_array_equal(made, alone)
-    assert predictor.lost == 13_000
+    assert predictor.clock.lost == 13_000
 
 
 def test_late_and_repeated_blocks_leave_no_trace():
@@ -220,7 +220,7 @@ def test_late_and_repeated_blocks_leave_no_trace():
     b = cut(v)
     made = predicted(predictor, [b[0], b[0], b[1], b[2], b[1], b[2], *b[3:]])
     np.testing.assert_array_equal(made, m.predict_piece(Piece(v, v, RATE)))
-    assert predictor.late == 300 and predictor.restarts == 0
+    assert predictor.clock.late == 300 and predictor.clock.restarts == 0
     # blocks of another size that overlap are cut to what is new
     more = Samples(np.arange(2950, 3050) / RATE, np.full(100, v[-1]))
     assert predictor.process(more).t.size == 50
@@ -233,7 +233,7 @@ def test_a_block_with_nan_is_left_out():
     bad = Samples(blocks[5].t, np.where(np.arange(100) == 50, np.nan, blocks[5].values))
     made = predicted(predictor, [*blocks[:5], bad, *blocks[6:]])
     assert np.isfinite(made).all() and made.size == 2900
-    assert predictor.lost == 100
+    assert predictor.clock.lost == 100
 
 
 def test_another_sampling_rate_is_refused():

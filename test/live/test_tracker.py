@@ -71,7 +71,7 @@ def test_limits_and_slew_hold_whatever_comes(seed):
         block[rng.random(block.size) < 0.05] = rng.choice([np.nan, np.inf, 1.0])
         parts.append(tracker.process(block, restarted=bool(rng.random() < 0.2)).v)
         if k % 5 == 4:
-            tracker.take_over(tracker.successor(models[k % 2], tracker.past()))
+            tracker.take_over(tracker.successor(models[k % 2]))
     parts += [tracker.finish().v, tracker.idle(3000)[1]]
     v = np.concatenate(parts)
     assert v.min() >= 1.0 and v.max() <= 9.0
@@ -90,7 +90,7 @@ def test_another_model_takes_over_without_a_glitch(seconds):
     plain = tracked(Tracker(PAPER, SETTINGS), reference)[1]
     tracker = Tracker(PAPER, SETTINGS)
     before = tracked(tracker, reference[:k])
-    successor = tracker.successor(other, tracker.past())
+    successor = tracker.successor(other)
     # the stream goes on while it is made
     between = tracked(tracker, reference[k : k + 1000])
     tracker.take_over(successor)
@@ -108,7 +108,7 @@ def test_another_model_takes_over_without_a_glitch(seconds):
 
 def test_before_the_first_block_a_model_is_merely_replaced():
     tracker = Tracker(PAPER, SETTINGS)
-    tracker.take_over(tracker.successor(CREEP, tracker.past()))
+    tracker.take_over(tracker.successor(CREEP))
     _, v, wanted = tracked(tracker, sine(0.5))
     assert np.abs(CREEP.simulate(v) - wanted).max() < 1e-8
 
@@ -116,7 +116,7 @@ def test_before_the_first_block_a_model_is_merely_replaced():
 def test_what_does_not_fit_is_refused():
     tracker = Tracker(PAPER, SETTINGS)
     with pytest.raises(ModelError, match='reference is sampled at 20000 Hz, the model holds for'):
-        tracker.successor(replace(PAPER, sample_rate=10_000.0), tracker.past())
+        tracker.successor(replace(PAPER, sample_rate=10_000.0))
     with pytest.raises(DataError, match='at least one number'):
         tracker.process([])
 
@@ -202,7 +202,7 @@ def test_another_model_takes_over_and_is_followed_anew():
     v, error = [], []
     for k in range(0, x.size, 100):
         if k == int(FS) // 2:
-            tracker.take_over(tracker.successor(CREEPS, tracker.past()))
+            tracker.take_over(tracker.successor(CREEPS))
         drive = tracker.process(x[k : k + 100])
         y = stage.process(drive.v)
         tracker.measured(Samples(drive.t, y))

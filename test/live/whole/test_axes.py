@@ -52,7 +52,7 @@ def test_a_gap_is_bridged_on_every_axis():
     predictor.set_model(scanner())
     v[:, 1001:1050] = v[:, [1000]] + np.arange(1, 50) / 50 * (v[:, [1050]] - v[:, [1000]])
     made = [predicted(predictor, v[:, a:b], RATE, a) for a, b in ((0, 1001), (1050, 3000))]
-    assert predictor.lost == 49
+    assert predictor.clock.lost == 49
     whole = np.delete(simulated(scanner(), v), np.s_[1001:1050], axis=1)
     np.testing.assert_allclose(np.hstack(made), whole, rtol=0.0, atol=1e-9 * 50e-6)
 

@@ -87,7 +87,7 @@ def test_a_gap_is_bridged_and_the_memory_is_unknown_until_the_next_sweep():
     made.append(predicted(predictor, v[:, 2050:2060], RATE, start=2050))
     assert not predictor.memory_known
     made.append(predicted(predictor, v[:, 2060:], RATE, start=2060))
-    assert predictor.lost == 49 and predictor.memory_known
+    assert predictor.clock.lost == 49 and predictor.memory_known
     whole = np.delete(simulated(model, v), np.s_[2001:2050], axis=1)
     np.testing.assert_allclose(np.hstack(made), whole, rtol=0.0, atol=1e-12 * np.ptp(whole))
 
