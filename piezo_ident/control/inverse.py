@@ -222,26 +222,11 @@ def _described(task: _Task, best: _Pass, passes: int) -> Inverse:
 @dataclass(frozen=True, eq=False)
 class _Task:
     """
-    A wanted motion with rest before and after it, in which the voltage may already move.
+    A motion `wanted` [m] with rest before and after it, in which the voltage may already move.
 
-    Attributes
-    ----------
-    model : StageModel
-    wanted : ndarray
-        Displacement without the rest around it [m].
-    bounds : tuple of float
-        Lowest and highest voltage [V], and slew [V/s].
-    clip : bool
-    H, Q : HysteresisInverse or RateInverse, and LinearInverse
-    rest : float
-        Normalised voltage at which the motion begins.
-    x, t : ndarray, shape (n,)
-        Wanted motion, normalised, and time [s].
-    channels : mapping of str to ndarray, shape (n,)
-    span, small : float
-        Span of the motion, and error that counts as a miss, both normalised.
-    warnings : tuple of str
-        A warning if H differs from that of the model.
+    `bounds` are lowest and highest voltage [V], and slew [V/s].  The motion with the rest around
+    it, `x`, its `span`, the error that counts as a miss, `small`, and the voltage at which the
+    motion begins, `rest`, are normalised.  `warnings` say if H differs from that of the model.
     """
 
     model: StageModel
@@ -265,12 +250,7 @@ class _Task:
 
 
 class _Pass(NamedTuple):
-    """
-    One pass of the iteration, normalised; all of shape (n,).
-
-    `error` is the error of the model under the voltage `u`.  `missed` marks samples whose H is out
-    of reach, and `reached` is H.
-    """
+    """Voltage of a pass, error of the model, samples with H out of reach, and H; normalised."""
 
     u: Array
     error: Array

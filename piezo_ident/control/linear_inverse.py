@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,9 @@ RINGS = 0.2
 BEYOND = 1.2
 
 
+Filter = TypeVar('Filter', bound='LinearInverse')
+
+
 @dataclass(frozen=True, eq=False)
 class LinearInverse:
     """
@@ -75,33 +78,33 @@ class LinearInverse:
     behind: int
 
     @property
+    def size(self) -> Array:
+        """Size of each tap."""
+        return np.abs(self.taps)
+
+    @property
     def reach(self) -> int:
         """Distance beyond which a sample of the wanted motion matters less than `REACH`."""
-        return reach_of(np.abs(self.taps), self.ahead)
+        total = np.cumsum(self.size)
+        first, last = np.searchsorted(total, total[-1] * np.array([REACH, 1.0 - REACH]))
+        return int(max(self.ahead - first, last - self.ahead, 0))
 
-    def shortened(self, most: int) -> LinearInverse:
-        """Limit the samples ahead to `most`, the past as `past_of` does; keep the static gain."""
-        ahead, behind = min(self.ahead, most), past_of(np.abs(self.taps), self.behind)
+    def shortened(self: Filter, most: int) -> Filter:
+        """Limit the samples ahead to `most`, the past to the part that counts; keep the gain."""
+        size = self.size
+        idle = int(np.argmax(np.cumsum(size[::-1]) > MISSED * size.sum()))
+        ahead, behind = min(self.ahead, most), min(max(self.behind - idle, 0), MOST_BEHIND)
         taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
-        return LinearInverse(taps * (self.taps.sum() / taps.sum()), ahead, behind)
+        return replace(self, taps=self.with_gain(taps), ahead=ahead, behind=behind)
+
+    def with_gain(self, taps: Array) -> Array:
+        """Scale other taps to the static gain of this filter."""
+        return np.asarray(taps * (self.taps.sum() / taps.sum()))
 
     def __call__(self, x: Array) -> Array:
         """Filter a signal of shape (n,) that rests before and after its samples."""
         padded = np.pad(x, (self.behind, self.ahead), mode='edge')
         return np.asarray(oaconvolve(padded, self.taps, mode='valid'))
-
-
-def past_of(size: Array, behind: int) -> int:
-    """Shorten the past of a filter, `behind` samples, to the part that counts by its sizes."""
-    idle = int(np.argmax(np.cumsum(size[::-1]) > MISSED * size.sum()))
-    return min(max(behind - idle, 0), MOST_BEHIND)
-
-
-def reach_of(size: Array, ahead: int) -> int:
-    """Compute the reach of a filter from the sizes of its taps, of which `ahead` come first."""
-    total = np.cumsum(size)
-    first, last = np.searchsorted(total, total[-1] * np.array([REACH, 1.0 - REACH]))
-    return int(max(ahead - first, last - ahead, 0))
 
 
 class Cut(NamedTuple):
@@ -114,22 +117,11 @@ class Cut(NamedTuple):
 
 def cut(size: Array, last: float) -> tuple[float, Cut | None]:
     """
-    Cut off the ends of a filter.
+    Cut off the ends of a filter; return the share of the ends, and None for too short a filter.
 
-    Parameters
-    ----------
-    size : ndarray, shape (n,)
-        Sizes of the taps; the middle one belongs to the present sample.
-    last : float
-        Share of the ends in a filter half as long.
-
-    Returns
-    -------
-    left : float
-        Share of the ends: the outer quarters.  If the ends are empty, the filter has not wrapped
-        around.
-    cut : Cut or None
-        The used taps, or None for too short a filter.
+    The middle one of the taps, whose sizes are given, belongs to the present sample.  The ends are
+    the outer quarters; if they are empty, the filter has not wrapped around.  `last` is the share
+    of the ends in a filter half as long.
     """
     n = len(size)
     before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
@@ -147,19 +139,9 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
     """
     Invert the linear and fast part of a model: G, the delay, and the effects that filter them.
 
-    The static gain of the filter is exact.
-
-    Parameters
-    ----------
-    model : StageModel
-    iterated : bool, optional
-        Whether an iteration with the whole model follows.  The filter may then leave out poles
-        that are too slow for `LONGEST` samples, if they hold little of the static gain.
-
-    Raises
-    ------
-    ModelError
-        When G has no static gain, or needs a filter of more than `LONGEST` samples.
+    The static gain of the filter is exact.  If an iteration with the whole model follows
+    (`iterated`), the filter may leave out poles that are too slow for `LONGEST` samples and hold
+    little of the static gain.  ModelError when G has no static gain, or needs a longer filter.
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):

@@ -13,12 +13,10 @@ for one axis.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
-from piezo_ident.control.linear_inverse import cut, LONGEST, past_of, reach_of, SHORTEST
+from piezo_ident.control.linear_inverse import cut, LinearInverse, LONGEST, SHORTEST
 from piezo_ident.model.modes.modal import Modal
 from scipy.signal import oaconvolve
 
@@ -26,28 +24,17 @@ from scipy.signal import oaconvolve
 SINGULAR = 1e4
 
 
-class AxesFilter(NamedTuple):
-    """
-    Filter of several axes that needs `ahead` samples after and `behind` samples before a sample.
-
-    Its `taps` have the shape (ahead + 1 + behind, outputs, inputs).
-    """
-
-    taps: Array
-    ahead: int
-    behind: int
+class AxesFilter(LinearInverse):
+    """Filter of several axes, with taps of the shape (ahead + 1 + behind, outputs, inputs)."""
 
     @property
-    def reach(self) -> int:
-        """Distance beyond which a sample matters less than `REACH`."""
-        return reach_of(_size(self.taps), self.ahead)
+    def size(self) -> Array:
+        """Sum of the sizes of each tap of all paths."""
+        return np.asarray(np.abs(self.taps).sum(axis=(1, 2)))
 
-    def shortened(self, most: int) -> AxesFilter:
-        """Limit the samples ahead to `most`, the past as `past_of` does; keep the static gain."""
-        ahead, behind = min(self.ahead, most), past_of(_size(self.taps), self.behind)
-        taps = self.taps[self.ahead - ahead : self.ahead + 1 + behind]
-        static = self.taps.sum(axis=0) @ np.linalg.inv(taps.sum(axis=0))
-        return AxesFilter(static @ taps, ahead, behind)
+    def with_gain(self, taps: Array) -> Array:
+        """Scale other taps to the static gain of this filter."""
+        return np.asarray(self.taps.sum(axis=0) @ np.linalg.inv(taps.sum(axis=0)) @ taps)
 
     def __call__(self, x: Array) -> Array:
         """Filter signals of shape (n, inputs) that rest before and after their samples."""
@@ -72,25 +59,11 @@ def static_gain(G: Modal, spans: Array) -> Array:
 
 def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, AxesFilter]:
     """
-    Invert a linear model of several axes where its gain is not small.
+    Invert a linear model of several axes where its gain is not small; return Q, and P = G Q.
 
-    Parameters
-    ----------
-    G : Modal
-    spans : ndarray, shape (axes,)
-        Displacements by which errors of the axes are compared [m].
-    least : float
-        Share of the static gain below which G is not inverted.
-
-    Returns
-    -------
-    Q, P : AxesFilter
-        The inverse, and G Q.  Their static gains are exact.
-
-    Raises
-    ------
-    ModelError
-        When the static gain has no inverse, or the filter needs more than `LONGEST` samples.
+    The static gains of both are exact.  Errors of the axes are compared by the displacements
+    `spans` [m].  G is not inverted below the share `least` of its static gain.  ModelError when
+    the static gain has no inverse, or the filter needs more than `LONGEST` samples.
     """
     static = static_gain(G, spans)
     n, left = SHORTEST, np.inf
@@ -100,7 +73,7 @@ def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, A
         back = whole.conj().swapaxes(1, 2)
         Q = np.linalg.solve(back @ whole + least**2 * np.eye(len(spans)), back)
         taps = [np.roll(np.fft.irfft(x, n, axis=0), n // 2, axis=0) for x in (Q, whole @ Q)]
-        left, enough = cut(_size(taps[0]), left)
+        left, enough = cut(np.abs(taps[0]).sum(axis=(1, 2)), left)
         if enough is not None:
             parts = [x[enough.used] for x in taps]
             q, p = (x @ np.linalg.inv(x.sum(axis=0)) for x in parts)
@@ -112,8 +85,3 @@ def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, A
         f'these modes have no inverse of less than {LONGEST} samples: a zero of the modes dies '
         'away too slowly; diagnose again with longer periods'
     )
-
-
-def _size(taps: Array) -> Array:
-    """Add the sizes of the taps of all paths, shape (n,)."""
-    return np.asarray(np.abs(taps).sum(axis=(1, 2)))
