@@ -182,13 +182,9 @@ class Snapshot:
 
 class Capture:
     """
-    All blocks of all topics so far.
+    All blocks of all topics so far, at most the time `limit` [s].
 
-    Parameters
-    ----------
-    limit : float, optional
-        Longest kept time [s].  A longer capture drops the oldest run of the sample clock, or the
-        oldest tenth of a single run.
+    A longer capture drops the oldest run of the sample clock, or the oldest tenth of a single run.
     """
 
     def __init__(self, limit: float = 600.0) -> None:
@@ -269,14 +265,10 @@ class Capture:
         """Return the time of the newest sample of a topic [s]; NaN before the first."""
         return self._topics[key].clock.last if key in self._topics else float('nan')
 
-    def seconds_of(self, key: str) -> float:
-        """Return the kept time of a topic [s]."""
-        return self.seconds_since({}, key)
-
     @property
     def seconds(self) -> float:
         """Kept time of the voltage [s]."""
-        return self.seconds_of('voltage')
+        return self.seconds_since({})
 
     @property
     def segments(self) -> Mapping[str, int]:

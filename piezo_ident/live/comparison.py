@@ -56,10 +56,6 @@ class AxisComparison:
         self.room: float | None = None
         self._ends = (np.inf, -np.inf)
 
-    def set_window(self, window: float) -> None:
-        """Change the time over which the live errors are taken [s]."""
-        self.error.window = self.left.window = window
-
     def set_model(self, model: StageModel, recalled: Recalled = StageModel.stream) -> None:
         """Take another model; `recalled` as for `Corrector.set_model`."""
         self.corrector.set_model(model, recalled)

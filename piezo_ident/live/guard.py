@@ -19,7 +19,7 @@ The simulated stage and the excitation use the guard; a driver of real hardware 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -114,7 +114,7 @@ class Applied:
     """
 
     voltage: NDArray[np.float64]
-    altered: Mapping[str, int] = field(default_factory=dict)
+    altered: Mapping[str, int]
 
 
 @kernel

@@ -102,54 +102,42 @@ class TrackingErrors:
     """
     Wanted minus measured displacement of each axis.
 
-    `tails` are the suffixes of the topics of all axes.  The rms is taken over a time `window` [s].
-    `percents` has the rms of each axis at the last `look` [% of the span of the wanted motion].
+    `tails` are the suffixes of the topics of all axes, `each` has the error by suffix.  The rms is
+    taken over a time `window` [s].  `percents` has the rms of each axis at the last `look` [% of
+    the span of the wanted motion].
     """
 
     def __init__(self, tails: Sequence[str], window: float) -> None:
-        self._each = {tail: TrackingError(window, f'tracking_error{tail}') for tail in tails}
+        self.each = {tail: TrackingError(window, f'tracking_error{tail}') for tail in tails}
         self.percents: dict[str, float] = {}
-
-    def set_window(self, window: float) -> None:
-        """Change the time over which the rms is taken [s]."""
-        for one in self._each.values():
-            one.live.window = window
 
     def clear(self) -> None:
         """Forget the errors so far."""
-        for one in self._each.values():
+        for one in self.each.values():
             one.live.clear()
 
     def wanted(self, t: Array, rows: Array, segment: str) -> list[Samples]:
         """Take the wanted motion of all axes, a row each; return the errors that it completes."""
         return [
             error
-            for one, row in zip(self._each.values(), np.atleast_2d(rows), strict=True)
+            for one, row in zip(self.each.values(), np.atleast_2d(rows), strict=True)
             for error in one.wanted(Samples(t, row, segment, 'reference'))
         ]
-
-    def measured(self, tail: str, samples: Samples) -> list[Samples]:
-        """Take the displacement of an axis; return the errors that it completes."""
-        return self._each[tail].measured(samples)
-
-    def is_waiting(self, tail: str) -> bool:
-        """Return whether wanted motion of an axis waits for its displacement."""
-        return self._each[tail].is_waiting
 
     @property
     def outliers(self) -> int:
         """Number of readings that the errors leave out."""
-        return sum(one.live.outliers for one in self._each.values())
+        return sum(one.live.outliers for one in self.each.values())
 
     def look(self) -> None:
         """Update `percents`."""
-        percents = {tail: one.percent for tail, one in self._each.items()}
+        percents = {tail: one.percent for tail, one in self.each.items()}
         self.percents = {tail: x for tail, x in percents.items() if x is not None}
 
     def figures(self) -> dict[str, str]:
         """List the errors of the last `look`, for /diagnostics."""
         figures = {}
         for tail, percent in self.percents.items():
-            figures[f'tracking_rms{tail}'] = f'{self._each[tail].live.rms:.6g}'
+            figures[f'tracking_rms{tail}'] = f'{self.each[tail].live.rms:.6g}'
             figures[f'tracking_percent{tail}'] = f'{percent:.4g}'
         return figures

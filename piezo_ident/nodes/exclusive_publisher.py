@@ -40,19 +40,9 @@ class ExclusivePublisher:
     """
     A publisher of blocks that asks for the right to drive before it sends.
 
-    Parameters
-    ----------
-    node : Node
-    topic : str
-    stays : bool, optional
-        Whether the publisher also exists between two drives.  It then refuses to drive beside any
-        publisher of another node name.  Without `stays` it drives beside a silent publisher, such
-        as an excitation between two programs; that excitation does not start beside this one.
-
-    Attributes
-    ----------
-    topic : str
-        Full name of the topic.
+    A publisher that `stays` between two drives refuses to drive beside any publisher of another
+    node name.  Otherwise it drives beside a silent publisher, such as an excitation between two
+    programs; that excitation does not start beside this one.  `topic` is the full name.
     """
 
     def __init__(self, node: Node, topic: str, *, stays: bool = False) -> None:

@@ -90,24 +90,21 @@ class FeedforwardNode(DrivingNode):
         self._looks = Looks()
         self._last = self._answered = time.monotonic()
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
-        self._clear()
+        self._errors = TrackingErrors(self._tails, self.values['window'])
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
-        topics = [f'tracking_error{tail}' for tail in self._tails]
         self._tracking_errors = {
-            topic: self.create_publisher(Float64MultiArray, topic, STREAM) for topic in topics
+            topic: self.create_publisher(Float64MultiArray, topic, STREAM)
+            for topic in (f'tracking_error{tail}' for tail in self._tails)
         }
         self._loader = ModelLoader(self, self._prepared, self._take_model, self.report_state)
         if path := self.values['model']:
             self._loader.begin_with(path)
+        listen = partial(self.create_subscription, Float64MultiArray)
         self._references = {}
         for tail in self._tails:
-            self._references[tail] = self.create_subscription(
-                Float64MultiArray, f'reference{tail}', partial(self._on_reference, tail), STREAM
-            )
-            on_displacement = partial(self._on_displacement, tail)
-            self.create_subscription(
-                Float64MultiArray, f'displacement{tail}', on_displacement, STREAM
-            )
+            take = partial(self._on_reference, tail)
+            self._references[tail] = listen(f'reference{tail}', take, STREAM)
+            listen(f'displacement{tail}', partial(self._on_displacement, tail), STREAM)
         self.offer('start', self._start)
         self.offer('learn', self._learn)
         self.report_state()
@@ -131,7 +128,8 @@ class FeedforwardNode(DrivingNode):
     def apply(self, changed: Mapping[str, Any]) -> None:
         """Take a model file, another window, or other limits."""
         if 'window' in changed:
-            self._errors.set_window(changed['window'])
+            for one in self._errors.each.values():
+                one.live.window = changed['window']
         if (model := self._model) is not None and set(changed) & set(LIMITS):
             self._tracker = None
             self._loader.load(self._source, lambda: model)
@@ -213,14 +211,11 @@ class FeedforwardNode(DrivingNode):
         if self._tracker is None:
             reason = self._refusal or 'publish one on the topic model, or set the parameter model'
             raise ConfigError(f'there is no model: {reason}')
-        self._clear()
+        self._errors = TrackingErrors(self._tails, self.values['window'])
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._take_right(self._tracker)
         self._wanted.reset(self._tracker.rest[1:])
         return self._tracker
-
-    def _clear(self) -> None:
-        self._errors = TrackingErrors(self._tails, self.values['window'])
 
     # the reference
 
@@ -297,7 +292,7 @@ class FeedforwardNode(DrivingNode):
 
     def _on_displacement(self, tail: str, message: Float64MultiArray) -> None:
         # a slow stage may answer the last blocks when the node is at rest already
-        is_waiting = self._errors.is_waiting(tail)
+        is_waiting = self._errors.each[tail].is_waiting
         if self._state not in ('tracking', 'learning', 'stopping') and not is_waiting:
             return
         try:
@@ -309,7 +304,7 @@ class FeedforwardNode(DrivingNode):
             about = 'samples of displacement are no numbers: left out of the tracking error'
             self._faults.note('not_finite', f'{bad} {about}', bad)
         self._answered = time.monotonic()
-        self._tell(self._errors.measured(tail, samples))
+        self._tell(self._errors.each[tail].measured(samples))
         if self._learner is not None:
             self._learner.measured(samples, self._tails.index(tail))
         if self._tracker is not None:

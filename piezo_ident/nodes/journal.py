@@ -67,13 +67,7 @@ class RecentFaults:
 
 
 class Journal:
-    """
-    Log of a node; any thread may write to it.
-
-    Parameters
-    ----------
-    logger : rclpy logger
-    """
+    """Log of a node, through its rclpy logger; any thread may write to it."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger

@@ -107,7 +107,7 @@ class ModelNode(LabNode):
             self._loader.load_file(path)
         if 'window' in changed:
             for one in self._comparisons.values():
-                one.set_window(changed['window'])
+                one.error.window = one.left.window = changed['window']
         if {*OBSERVED} & set(changed):
             new = {**self.values, **changed}
             horizon, gain, drift, adapt = (new[name] for name in OBSERVED)
@@ -152,16 +152,15 @@ class ModelNode(LabNode):
         return self._joined({k: x.corrector.restore() for k, x in self._comparisons.items()})
 
     def _accept(self) -> str:
-        said, refused = [], []
+        said, refused = dict[str, str](), dict[str, str]()
         for tail, one in self._comparisons.items():
-            axis = f'y{tail}: ' if self._tails[1:] else ''
             try:
-                said.append(f'{axis}{one.corrector.accept()}')
+                said[tail] = one.corrector.accept()
             except DataError as error:
-                refused.append(f'{axis}{error}')
+                refused[tail] = str(error)
         if not said:
-            raise DataError('; '.join(refused))
-        return '; '.join(said)
+            raise DataError(self._joined(refused))
+        return self._joined(said)
 
     def _on_block(self, what: str, tail: str, message: Float64MultiArray) -> None:
         begin = time.perf_counter()
@@ -270,13 +269,11 @@ class ModelNode(LabNode):
         several = len(self._tails) > 1
         return '; '.join(f'y{t}: {x}' if several else x for t, x in texts.items() if x)
 
-    def _left_out(self) -> str:
-        return self._joined({tail: one.left_out for tail, one in self._comparisons.items()})
-
     def _report_state(self) -> None:
         fresh = [p for p, at in self._problems.items() if time.monotonic() - at < REMEMBER]
         self._problems = {p: self._problems[p] for p in fresh[-MOST:]}
-        problems = [self._refusal, *self._problems, self._left_out()]
+        left_out = self._joined({tail: one.left_out for tail, one in self._comparisons.items()})
+        problems = [self._refusal, *self._problems, left_out]
         state = 'predicting' if self._predictor.model is not None else 'waiting'
         message = f'with {self._source}' if self._source else 'for a model'
         if self._predictor.model is not None and self._is_lost:
@@ -290,9 +287,7 @@ class ModelNode(LabNode):
             if one.model is not None and one.error.seconds
         }
         values |= {f'residual_percent{tail}': x for tail, x in errors.items()}
-        brief = (
-            f'{" and ".join(errors.values())} % of stroke, live error; {text}' if errors else ''
-        )
+        brief = f'{" and ".join(errors.values())} % of stroke, live error; {text}' * bool(errors)
         wrong = '; '.join(filter(None, problems))
         self.report_status(state, 0.0, text, level, brief=brief, problems=wrong, **values)
 

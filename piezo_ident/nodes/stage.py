@@ -54,7 +54,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.errors import DataError
-from piezo_ident.live.guard import Applied, Guard, GuardSettings, LAST_RAMP
+from piezo_ident.live.guard import Guard, GuardSettings, LAST_RAMP
 from piezo_ident.live.join import Join
 from piezo_ident.live.pacing import Looks, Pace, Rate
 from piezo_ident.live.sample_clock import Kind, SampleClock
@@ -107,34 +107,25 @@ class StageNode(LabNode):
         self._counts = self._faults.counts
         self._state = 'idle'
         self._looks, self._last = Looks(), time.monotonic()
-        self._pace = self._new_pace()
+        self._pace = Pace(self.sample_rate, 5 * RAMP_PERIOD)
         self._rate, self._work_rate, self._busy = Rate(), Rate(), 0.0
         self._displacement, self._applied = (
             [self.create_publisher(Float64MultiArray, f'{q}{x}', STREAM) for x in self._tails]
             for q in ('displacement', 'applied_voltage')
         )
         self._join = Join(self._tails[1:], self.sample_rate)
+        listen = functools.partial(self.create_subscription, Float64MultiArray, qos_profile=STREAM)
         self._further = {
-            tail: self.create_subscription(
-                Float64MultiArray,
-                f'voltage{tail}',
-                functools.partial(self._on_further, tail),
-                STREAM,
-            )
+            tail: listen(f'voltage{tail}', functools.partial(self._on_further, tail))
             for tail in self._tails[1:]
         }
-        self._input = self.create_subscription(
-            Float64MultiArray, 'voltage', self._on_voltage, STREAM
-        )
+        self._input = listen('voltage', self._on_voltage)
         self._watch = self.create_timer(self._watch_period(), self._on_watch)
         self._ramp_timer = self.create_timer(RAMP_PERIOD, self._on_ramp, autostart=False)
 
     def _warm_up(self) -> None:
         """Compile the kernels, so that the first block need not wait."""
-        run, guard = (
-            self._stage.run(np.random.default_rng(0)),
-            Guard(self._axis_guards[0].settings),
-        )
+        run, guard = self._stage.run(np.random.default_rng(0)), Guard(self._settings())
         rest = guard.applied
         for v in ([rest] * 2, [rest, math.nan]):
             run.process(self._command([guard.process(v).voltage] * len(self._tails)))
@@ -243,7 +234,7 @@ class StageNode(LabNode):
             if missing and (missing < command.size or not guard.is_at_rest):
                 about = f'{missing} samples of voltage{tail} are missing: the last stays in force'
                 self._faults.note('missing', about, missing)
-        applied: Applied = guard.process(command, restarted=restarted)
+        applied = guard.process(command, restarted=restarted)
         for why, n in applied.altered.items():
             if not (tail and why == 'not_finite'):
                 self._faults.note(why, f'{n} {_WHY[why]}', n)
@@ -285,11 +276,8 @@ class StageNode(LabNode):
 
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', RAMPED
-        self._pace = self._new_pace()
+        self._pace = Pace(self.sample_rate, 5 * RAMP_PERIOD)
         self._ramp_timer.reset()
-
-    def _new_pace(self) -> Pace:
-        return Pace(self.sample_rate, 5 * RAMP_PERIOD)
 
     def _on_ramp(self) -> None:
         if (due := self._pace.due()) > 0:
@@ -315,7 +303,6 @@ class StageNode(LabNode):
         rate, worked = self._rate.of(samples), self._work_rate.of(self._busy)
         faults = self._faults.text
         refused = ('malformed', 'repeat', 'late', 'second')
-        altered = ('not_finite', 'outside_limits', 'too_fast', 'joining')
         values: dict[str, object] = {
             'rate': f'{rate:.1f}',
             'samples': samples,
@@ -325,7 +312,7 @@ class StageNode(LabNode):
             'streams': self._counts['streams'],
             'silences': self._counts['silence'],
             **{f'refused_{why}': self._counts[why] for why in refused},
-            **{f'altered_{why}': self._counts[why] for why in altered},
+            **{f'altered_{why}': self._counts[why] for why in _WHY},
             'clipped': self._run.clipped_input + self._run.clipped_output,
             'publishers': self._input.get_publisher_count(),
             **{

@@ -149,11 +149,7 @@ class RawSubscriptions:
     """
     Subscriptions of a recording: serialised messages, with the QoS that publishers offer.
 
-    Parameters
-    ----------
-    node : Node
-    topics : iterable of str
-        Full names.
+    The `topics` have full names.
     """
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:

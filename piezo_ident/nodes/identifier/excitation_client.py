@@ -51,16 +51,8 @@ class ExcitationClient:
     """
     Plays one program of the excitation at a time.
 
-    All calls return at once; `poll` looks for responses.
-
-    Parameters
-    ----------
-    node : Node
-        Gets the clients and the subscription.
-    streams : callable
-        Returns the present `Streams`.
-    missing : callable
-        Returns the topics without a publisher, as text; '' if all have one.
+    All calls return at once; `poll` looks for responses.  `streams` returns the present `Streams`,
+    `missing` the topics without a publisher, as text.
     """
 
     def __init__(
@@ -106,11 +98,8 @@ class ExcitationClient:
         """Cause of the wait for the first block, for people; '' after the first block."""
         if self._phase == 'finding':
             missing = self._missing()
-            return (
-                f'waiting for a publisher of {missing}'
-                if missing
-                else 'looking for the excitation'
-            )
+            about = f'waiting for a publisher of {missing}'
+            return about if missing else 'looking for the excitation'
         if self._phase == 'playing' and self._state == 'waiting':
             return f'the excitation is {self._message}'
         return 'calling the excitation' if self._phase not in ('', 'playing') else ''
@@ -118,8 +107,11 @@ class ExcitationClient:
     @property
     def is_possible(self) -> bool:
         """Whether an excitation and a stage have been discovered."""
-        ready = self._set.service_is_ready() and self._start.service_is_ready()
-        return ready and not self._missing()
+        return self._is_ready and not self._missing()
+
+    @property
+    def _is_ready(self) -> bool:
+        return bool(self._set.service_is_ready() and self._start.service_is_ready())
 
     def start(
         self,
@@ -129,19 +121,11 @@ class ExcitationClient:
         begin: Callable[[], None] | None = None,
     ) -> None:
         """
-        Begin a run.
+        Begin a run of a program, for the excitation's parameter ``program``.
 
-        Parameters
-        ----------
-        program : str
-            For the excitation's parameter ``program``.
-        limit : float
-            Longest silence of the excitation or the stage [s].
-        ended : callable
-            Called once: with None when the program was captured to its end, else with the reason.
-            Not called after `stop`.
-        begin : callable, optional
-            Called when the excitation has accepted the start.
+        The excitation and the stage may be silent for at most `limit` [s].  `begin` is called when
+        the excitation has accepted the start.  `ended` is called once, except after `stop`: with
+        None when the program was captured to its end, else with the reason.
         """
         self._program, self._limit = program, limit
         self._begin, self._ended = begin or _nothing, ended
@@ -207,7 +191,7 @@ class ExcitationClient:
         return self._looks.is_over(self._sign, self._limit)
 
     def _finding(self) -> None:
-        ready = self._set.service_is_ready() and self._start.service_is_ready()
+        ready = self._is_ready
         missing = self._missing() if ready else ''
         if ready and not missing:
             self._phase, self._sign = 'asking', time.monotonic()

@@ -84,7 +84,7 @@ class IdentifierNode(LabNode):
         self.create_timer(DRAIN, self._drain)
         self.create_timer(POLL, self._poll)
         self._wake = self.create_guard_condition(self._take_outcomes)
-        self.offer('identify', self._identify_all)
+        self.offer('identify', functools.partial(self._identify, 'all'))
         for step in ('delay', 'dynamics', 'hysteresis'):
             self.offer(f'identify_{step}', functools.partial(self._identify, step))
         for name in ('run', 'diagnose', 'cancel', 'clear', 'save'):
@@ -135,7 +135,7 @@ class IdentifierNode(LabNode):
 
     def _kept(self) -> str:
         keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
-        return ', '.join(f'{self._capture.seconds_of(key):.3f} s of {key}' for key in keys)
+        return ', '.join(f'{self._capture.seconds_since({}, key):.3f} s of {key}' for key in keys)
 
     def _is_busy(self) -> bool:
         # parameters are declared before the other attributes exist
@@ -189,30 +189,23 @@ class IdentifierNode(LabNode):
             self.fail(reason)
             return
         try:
-            self._identify_all()
+            self._identify('all')
         except PiezoIdentError as error:
             self.fail(str(error))
-
-    def _refuse_when_empty(self) -> None:
-        if not self._capture.n:
-            raise DataError(
-                'nothing has been captured; start the excitation, call ~/run, or replay a bag'
-            )
-
-    def _identify_all(self) -> str:
-        return self._identify('all')
 
     def _identify(self, which: str) -> str:
         self._refuse_when_busy()
         if self._axes and which != 'all':
             raise PiezoIdentError('single steps are for a stage of one axis; call ~/identify')
-        self._refuse_when_empty()
+        if not self._capture.n:
+            raise DataError(
+                'nothing has been captured; start the excitation, call ~/run, or replay a bag'
+            )
         self._using = self._capture.mark()
-        settings = settings_of(self.values)
         job = functools.partial(
             identify_capture,
             self._capture.snapshot(),
-            settings,
+            settings_of(self.values),
             which,
             self._steps,
             self._session.model,
