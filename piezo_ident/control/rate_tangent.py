@@ -10,6 +10,9 @@ keeps its value.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
@@ -39,17 +42,13 @@ def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOpera
     gain = (1.0 - effect.pole) * effect.sample_rate
     parts = edge, weight, lower, upper, line, slope, effect.pole, gain
 
-    def forward(x: Array) -> Array:
-        out = np.empty(u.size)
-        _forward(np.ascontiguousarray(x.ravel()), *parts, out)
-        return out
-
-    def transposed(x: Array) -> Array:
+    def product(kernel: Callable[..., None], x: Array) -> Array:
         out = np.zeros(u.size)
-        _transposed(np.ascontiguousarray(x.ravel()), *parts, out)
+        kernel(np.ascontiguousarray(x.ravel()), *parts, out)
         return out
 
-    return LinearOperator((u.size, u.size), forward, transposed, dtype=np.float64)
+    products = partial(product, _forward), partial(product, _transposed)
+    return LinearOperator((u.size, u.size), *products, dtype=np.float64)
 
 
 @kernel

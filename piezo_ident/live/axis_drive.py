@@ -72,17 +72,16 @@ class AxisDrive:
     """
     Drives one axis by the voltage of an inverse; parameters and errors as for `Tracker`.
 
-    The axis begins at rest at the displacement `start` [m].  Its `follower` corrects the goal by
-    the measured error; it is None if `follow` is ``'off'``.
+    Begin with `reset`.  The `follower` corrects the goal by the measured error; it is None if
+    `follow` is ``'off'``.
     """
 
     def __init__(
-        self, model: StageModel, settings: GuardSettings, preview: int, follow: str, start: float
+        self, model: StageModel, settings: GuardSettings, preview: int, follow: str
     ) -> None:
         self._model = model
         self._settings, self._preview, self._follow = settings, preview, follow
         self._lock = threading.Lock()
-        self.reset(start)
 
     def reset(self, start: float) -> None:
         """Begin at rest at a displacement [m], with the clock of the voltage at zero."""

@@ -13,14 +13,18 @@ these turning points, the samples just before each, and the last seconds in full
 from __future__ import annotations
 
 from collections import deque
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import line_between
 from piezo_ident.common.kernel import kernel
 from piezo_ident.model.stage_model import StageModel
+from piezo_ident.model.stream import Stream
 from piezo_ident.record.blocks import Samples
+
+if TYPE_CHECKING:
+    from piezo_ident.control.live_inverse import LiveInverse
 
 #: time over which the voltage is kept sample by sample, for G of a new model [s]
 RECENT = 5.0
@@ -28,13 +32,6 @@ RECENT = 5.0
 APPROACH = 0.05
 #: most blocks of the last seconds
 MOST_BLOCKS = 100_000
-
-
-class Recalling(Protocol):
-    """A run whose plays can be set by a past voltage."""
-
-    def recall(self, v: NDArray[np.float64], t: NDArray[np.float64]) -> None:
-        """Move the plays along v [V] at the times t [s]."""
 
 
 @kernel
@@ -163,7 +160,7 @@ class History:
         return copy
 
     def recall(
-        self, run: Recalling, model: StageModel, period: float
+        self, run: LiveInverse | Stream, model: StageModel, period: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """
         Set a fresh run by the old part of the voltage, and return the recent part.

@@ -43,49 +43,6 @@ def held(x: Array, before: float) -> Array:
     return np.append(before, x)[np.maximum.accumulate(last)]
 
 
-class Companion:
-    """
-    Samples of one topic, by the tick of a clock of `sample_rate` [Hz].
-
-    Examples
-    --------
-    >>> voltage = Companion(10.0)
-    >>> voltage.add(Samples(np.array([0.0, 0.1]), np.array([5.0, 6.0])))
-    >>> voltage.has(np.array([0.1, 0.2])), voltage.take(np.array([0.1, 0.2])).tolist()
-    (False, [6.0, nan])
-    """
-
-    def __init__(self, sample_rate: float) -> None:
-        self._rate = sample_rate
-        self._kept: dict[int, float] = {}
-        self._newest = -1
-
-    def add(self, samples: Samples) -> None:
-        """Keep a block; a block whose time jumps back begins a new stream."""
-        ticks = self._ticks(samples.t)
-        if ticks[0] <= self._newest or len(self._kept) > MOST:
-            self._kept.clear()
-        self._kept.update(zip(ticks, samples.values.tolist(), strict=True))
-        self._newest = ticks[-1]
-
-    def clear(self) -> None:
-        """Forget all samples: the stream has ended."""
-        self._kept.clear()
-        self._newest = -1
-
-    def has(self, t: NDArray[np.float64]) -> bool:
-        """Return whether a sample is kept for each time, shape (n,) [s]."""
-        return all(tick in self._kept for tick in self._ticks(t))
-
-    def take(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Remove and return the samples at times t [s]; NaN stands for a missing sample."""
-        return np.array([self._kept.pop(tick, np.nan) for tick in self._ticks(t)])
-
-    def _ticks(self, t: NDArray[np.float64]) -> list[int]:
-        ticks: list[int] = np.rint(t * self._rate).astype(np.int64).tolist()
-        return ticks
-
-
 class Join:
     """
     Blocks of the first axis, each of which waits for the other axes at the same times.
@@ -104,6 +61,9 @@ class Join:
     >>> ((samples, *_),) = join.complete(is_over=lambda since: False)
     >>> join.rows(samples)[0].values.tolist()
     [[1.0, 2.0], [3.0, 4.0]]
+    >>> join.add('_b', Samples(t + 0.2, np.array([5.0, 6.0])), since=0.2)
+    >>> join.take('_b', t + 0.3).tolist()
+    [6.0, nan]
     """
 
     def __init__(
@@ -112,7 +72,9 @@ class Join:
         sample_rate: float = 1.0 / SHORTEST,
         rest: Sequence[float] = (),
     ) -> None:
-        self._companions = {tail: Companion(sample_rate) for tail in tails}
+        self._rate = sample_rate
+        # samples of each further axis by tick, and the tick of its newest sample
+        self._kept, self._newest = {tail: dict[int, float]() for tail in tails}, dict[str, int]()
         self._last = {**dict.fromkeys(tails, 0.0), **dict(zip(tails, rest, strict=False))}
         self._heard = dict.fromkeys(tails, -math.inf)
         # blocks, each with a note of the caller and its arrival
@@ -120,11 +82,19 @@ class Join:
 
     def add(self, tail: str, samples: Samples, since: float, note: Any = None) -> None:
         """Take a block of an axis, which came at a time `since` [s]; '' is the first axis."""
-        if tail:
-            self._companions[tail].add(samples)
-            self._heard[tail] = since
-        else:
+        if not tail:
             self._waiting.append((samples, note, since))
+            return
+        kept, ticks = self._kept[tail], self._ticks(samples.t)
+        # a block whose time jumps back begins a new stream
+        if ticks[0] <= self._newest.get(tail, -1) or len(kept) > MOST:
+            kept.clear()
+        kept.update(zip(ticks, samples.values.tolist(), strict=True))
+        self._newest[tail], self._heard[tail] = ticks[-1], since
+
+    def _ticks(self, t: NDArray[np.float64]) -> list[int]:
+        ticks: list[int] = np.rint(t * self._rate).astype(np.int64).tolist()
+        return ticks
 
     def complete(
         self, is_over: Callable[[float], bool], silent: Collection[str] = ()
@@ -139,8 +109,8 @@ class Join:
             samples, note, since = self._waiting[0]
             quiet = {tail for tail in silent if since - self._heard[tail] > HEARD}
             lacking = any(
-                tail not in quiet and not companion.has(samples.t)
-                for tail, companion in self._companions.items()
+                tail not in quiet and not kept.keys() >= {*self._ticks(samples.t)}
+                for tail, kept in self._kept.items()
             )
             if lacking and not is_over(since):
                 return
@@ -149,7 +119,7 @@ class Join:
 
     def take(self, tail: str, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Remove and return the samples of a further axis; NaN stands for a missing sample."""
-        return self._companions[tail].take(t)
+        return np.array([self._kept[tail].pop(tick, np.nan) for tick in self._ticks(t)])
 
     def rows(self, samples: Samples) -> tuple[Samples, dict[str, int]]:
         """
@@ -159,7 +129,7 @@ class Join:
         samples by axis.
         """
         rows, missing = [samples.values], {}
-        for tail in self._companions:
+        for tail in self._kept:
             x = self.take(tail, samples.t)
             if n := int(np.count_nonzero(~np.isfinite(x))):
                 missing[tail] = n
@@ -170,5 +140,6 @@ class Join:
 
     def clear(self) -> None:
         """Forget the further axes: the stream has ended."""
-        for companion in self._companions.values():
-            companion.clear()
+        for kept in self._kept.values():
+            kept.clear()
+        self._newest.clear()

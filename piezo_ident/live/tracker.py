@@ -71,10 +71,7 @@ class Tracker:
         else:
             each = [inverse_of(x, settings, preview) for x in single]
             self._inverse = LiveChains(each, model, axes)
-        self._each = [
-            AxisDrive(x, settings, preview, follow, start)
-            for x, start in zip(self._inverse.models, self._inverse.position, strict=True)
-        ]
+        self._each = [AxisDrive(x, settings, preview, follow) for x in self._inverse.models]
         self.reset()
 
     def reset(self) -> None:

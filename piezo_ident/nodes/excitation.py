@@ -146,16 +146,12 @@ class ExcitationNode(LabNode):
                 in_turn = values.get('in_turn', False)
                 built = build_axes(program, count, values['sample_rate'], limits, in_turn=in_turn)
             except ConfigError as error:
-                raise self._in_unit(error) from None
+                unit = UNITS[self.values['quantity']][0]
+                raise ConfigError(_VOLTS.sub(unit, str(error))) from None
             except (OSError, MemoryError) as error:
                 raise ConfigError(f'program: {error}') from None
             self._built = (key, built)
         return self._built[1]
-
-    def _in_unit(self, error: ConfigError) -> ConfigError:
-        """Replace V in an error by the unit of the quantity."""
-        unit = UNITS[self.values['quantity']][0]
-        return ConfigError(_VOLTS.sub(unit, str(error)))
 
     def _guard_settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
         v = values or self.values

@@ -61,12 +61,6 @@ def home_problem(path: str) -> str | None:
     return None
 
 
-def axes_problem(names: Sequence[str]) -> str | None:
-    """Return the problem if a text cannot be the name of a further axis, else None."""
-    bad = next((x for x in names if x and role_of(f'v_{x}') != 'v'), None)
-    return None if bad is None else f'axes: {bad!r} cannot be the name of an axis'
-
-
 def no_parameter(node: Node, name: str) -> str:
     """Say that a node has no such parameter, and guess the intended name."""
     known = node.list_parameters([], 0).names
@@ -168,8 +162,9 @@ class ParameterNode(Node):
             return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
         if isinstance(value, float) and value != value:
             return f'{name} must be a number, got NaN'
-        if name == 'axes' and (problem := axes_problem(value)):
-            return problem
+        bad = [x for x in value if x and role_of(f'v_{x}') != 'v'] if name == 'axes' else []
+        if bad:
+            return f'axes: {bad[0]!r} cannot be the name of an axis'
         try:
             return self.refuse(name, value)
         except PiezoIdentError as error:
