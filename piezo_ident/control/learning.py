@@ -246,12 +246,8 @@ class SharedLearning(Learning):
     """
     A repeated motion of an axis, whose drives come from an inverse of all axes.
 
-    Parameters
-    ----------
-    model : StageModel
-        Model of the axis, with scaling and modes.
-    drive : Inverse
-        First drive.  After each `learn` the caller sets the next one.
+    The model of the axis has scaling and modes.  After each `learn` the caller sets the next
+    `drive`.
     """
 
     def __init__(self, model: StageModel, drive: Inverse) -> None:

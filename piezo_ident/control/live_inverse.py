@@ -130,15 +130,9 @@ class LiveInverse:
         self.warnings += lines
         self._hysteresis, self._filter = inverted.hysteresis, linear_inverse(inverted)
         self.passes, self.error = self._tried()
-        if self.error > LARGE:
-            remedy = f'; {MOST_PASSES * self._filter.ahead} are enough for anything'
-            self.warnings += (
-                f'a preview of {preview} samples in {self.passes} passes leaves '
-                f'{self.error:.2g} % of stroke on a slow motion, were the model exact'
-                # a longer preview does not help plays that are inverted as lines
-                + remedy
-                * (not lines),
-            )
+        # a longer preview does not help plays that are inverted as lines
+        enough = '' if lines else f'; {MOST_PASSES * self._filter.ahead} are enough for anything'
+        self.warnings += preview_warnings(preview, self.passes, self.error, enough)
         self._passes = self._built(self.passes, self._slew)
         self.reset()
 
@@ -240,6 +234,15 @@ def trial_motion(stretch: float = 1.0) -> tuple[Array, Array]:
     k = np.arange(TRIAL)
     motion = np.sum([a * np.sin(2 * np.pi * k / (stretch * t)) for t, a in SINES], axis=0)
     return 0.5 - 0.5 * np.cos(np.pi * np.minimum(k / SINES[0][0], 1.0)), motion
+
+
+def preview_warnings(preview: int, passes: int, error: float, enough: str = '') -> tuple[str, ...]:
+    """Warn of a preview that leaves a large error on the trial motion."""
+    text = (
+        f'a preview of {preview} samples in {passes} passes leaves {error:.2g} % of stroke on a '
+        f'slow motion, were the model exact{enough}'
+    )
+    return (text,) if error > LARGE else ()
 
 
 class _Pass:

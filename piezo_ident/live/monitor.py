@@ -208,11 +208,12 @@ class TrackingError:
     """
     Wanted minus measured displacement, block by block.
 
-    `live` has the rms over a time `window` [s]; `quantity` is the name of the errors.
+    `live` has the rms over a time `window` [s]; `quantity` is the name of the errors.  Wanted
+    blocks wait in the `matcher` for their measured displacement.
     """
 
     def __init__(self, window: float, quantity: str = 'tracking_error') -> None:
-        self._matcher, self.live, self._quantity = Matcher(), LiveError(window), quantity
+        self.matcher, self.live, self._quantity = Matcher(), LiveError(window), quantity
         self._low, self._high = np.inf, -np.inf
 
     def wanted(self, samples: Samples) -> list[Samples]:
@@ -221,16 +222,11 @@ class TrackingError:
             return []
         self._low = min(self._low, float(samples.values.min()))
         self._high = max(self._high, float(samples.values.max()))
-        return self._errors(self._matcher.predicted(samples))
+        return self._errors(self.matcher.predicted(samples))
 
     def measured(self, samples: Samples) -> list[Samples]:
         """Take a block of displacement; return the errors that it completes."""
-        return self._errors(self._matcher.measured(samples))
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether wanted blocks still wait for their measured displacement."""
-        return self._matcher.is_waiting
+        return self._errors(self.matcher.measured(samples))
 
     @property
     def percent(self) -> float | None:

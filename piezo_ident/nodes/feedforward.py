@@ -292,7 +292,7 @@ class FeedforwardNode(DrivingNode):
 
     def _on_displacement(self, tail: str, message: Float64MultiArray) -> None:
         # a slow stage may answer the last blocks when the node is at rest already
-        is_waiting = self._errors.each[tail].is_waiting
+        is_waiting = self._errors.each[tail].matcher.is_waiting
         if self._state not in ('tracking', 'learning', 'stopping') and not is_waiting:
             return
         try:

@@ -27,7 +27,7 @@ from piezo_ident.control.axes.axes_inverse import AxesFilter, inverse_filters, s
 from piezo_ident.control.axes.modes_inverse import equivalent, Limited, signal_gains
 from piezo_ident.control.inputs import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import least_gain
-from piezo_ident.control.live_inverse import Driven, LARGE, PREVIEW, trial_motion, WORTH
+from piezo_ident.control.live_inverse import Driven, PREVIEW, preview_warnings, trial_motion, WORTH
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.modes.stream import ModesRun, ModesStream
@@ -93,12 +93,7 @@ class LiveModesInverse:
         self._bounds = _Bounds(low - v0, high - v0, rests - v0, short)
         self.error, Q, self.passes = self._tried(max(map(least_gain, each)))
         self._passes = self._built(Q, self.passes, float(speeds[0]))
-        self.warnings: tuple[str, ...] = ()
-        if self.error > LARGE:
-            self.warnings = (
-                f'a preview of {preview} samples in {self.passes} passes leaves '
-                f'{self.error:.2g} % of stroke on a slow motion, were the model exact',
-            )
+        self.warnings = preview_warnings(preview, self.passes, self.error)
         self.reset()
 
     def _built(self, Q: AxesFilter, passes: int, slew: float) -> list[_Pass]:

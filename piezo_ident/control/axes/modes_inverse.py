@@ -88,8 +88,7 @@ def invert_modes(
     """
     check_rate(model.sample_rate, sample_rate)
     task = _Task(model, modes, wanted, limits, slew, clip)
-    best = _iterated(task)
-    return _results(task, best, clip)
+    return _results(task, *_iterated(task), clip)
 
 
 class Limited:
@@ -235,14 +234,7 @@ class _Filters:
         return self.P(np.where(near[:, None], 0.0, now.error))
 
 
-class _Solved(NamedTuple):
-    """The best pass, and its filters."""
-
-    best: _Pass
-    filters: _Filters
-
-
-def _iterated(task: _Task) -> _Solved:
+def _iterated(task: _Task) -> tuple[_Pass, _Filters]:
     """Iterate until the error stops falling; raise ModelError if it hardly falls."""
     first = _Filters.of(task, np.zeros(task.modes.signals))
     begun = first.tried(task, first.x, 1)
@@ -268,7 +260,7 @@ def _iterated(task: _Task) -> _Solved:
             f'{100 * begun.left:.2g} % by the inverse of the linear modes; make the motion '
             'smaller or slower'
         )
-    return _Solved(best, filters)
+    return best, filters
 
 
 def signal_gains(modes: SharedModes, u: Array) -> Array:
@@ -296,9 +288,8 @@ class _Anderson:
         return np.asarray(m + step - np.tensordot(shares, moved + changed, axes=1))
 
 
-def _results(task: _Task, solved: _Solved, clip: bool) -> dict[str, Inverse]:
+def _results(task: _Task, best: _Pass, filters: _Filters, clip: bool) -> dict[str, Inverse]:
     """Cut off the lead and tail at rest, and describe the drive of each axis."""
-    best, filters = solved
     ahead = filters.Q.ahead
     for still in (*STILL, 0.0):
         away = np.abs((best.u - task.rest) @ task.static.T) > still * task.whole
