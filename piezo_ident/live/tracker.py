@@ -36,7 +36,8 @@ class Tracker:
 
     The stage is at rest before the first block.  Arrays of several axes have a row for each of
     `axes`, the names of the displacements.  The `settings` hold for each axis, at the rate of the
-    model.  An axis without an inverse within these limits raises the errors of `LiveInverse`.
+    model.  The `inverse` makes the voltages; an axis without one within these limits raises the
+    errors of `LiveInverse`.
 
     `follow` chooses the corrections of each axis by its measured displacement: none (``'off'``),
     offset and creep from earlier motion (``'offset'``), or these and the gain (``'gain'``).
@@ -62,22 +63,22 @@ class Tracker:
     ) -> None:
         self.settings, self.preview, self.follow, s = settings, preview, follow, settings
         single = [alone(model)[axis] for axis in axes]
-        self._inverse: LiveChains | LiveModesInverse
+        self.inverse: LiveChains | LiveModesInverse
         if isinstance(model, MultiAxisModel) and model.modes is not None:
             check_rate(single[0], s)
-            self._inverse = LiveModesInverse(
+            self.inverse = LiveModesInverse(
                 model, axes, limits=(s.low, s.high), slew=s.slew, preview=preview, rest=s.rest
             )
         else:
             each = [inverse_of(x, settings, preview) for x in single]
-            self._inverse = LiveChains(each, model, axes)
-        self._each = [AxisDrive(x, settings, preview, follow) for x in self._inverse.models]
+            self.inverse = LiveChains(each, model, axes)
+        self._each = [AxisDrive(x, settings, preview, follow) for x in self.inverse.models]
         self.reset()
 
     def reset(self) -> None:
         """Begin at rest, with the clock of the voltages at zero."""
-        self._inverse.reset()
-        for one, start in zip(self._each, self._inverse.position.tolist(), strict=True):
+        self.inverse.reset()
+        for one, start in zip(self._each, self.inverse.position.tolist(), strict=True):
             one.reset(start)
 
     @property
@@ -89,16 +90,6 @@ class Tracker:
     def rest(self) -> list[float]:
         """Displacement of each axis at rest [m]; after `reset`."""
         return [one.last_reference for one in self._each]
-
-    @property
-    def passes(self) -> int:
-        """Largest number of passes of the inverses."""
-        return self._inverse.passes
-
-    @property
-    def expected(self) -> float:
-        """Largest error that the finite preview leaves [% of stroke]."""
-        return self._inverse.error
 
     @property
     def tick(self) -> int:
@@ -120,8 +111,8 @@ class Tracker:
         each = self._each
         rows = zip(each, np.atleast_2d(reference), strict=True)
         wanted = np.stack([one.joined(row, restarted) for one, row in rows])
-        goals = zip(each, wanted, self._inverse.goals(wanted), strict=True)
-        driven = self._inverse.process(np.stack([one.corrected(*x) for one, *x in goals]))
+        goals = zip(each, wanted, self.inverse.goals(wanted), strict=True)
+        driven = self.inverse.process(np.stack([one.corrected(*x) for one, *x in goals]))
         drives = [one.drive(*x) for one, *x in zip(each, *driven, strict=True)]
         v, now = (_rows([getattr(drive, x) for drive in drives]) for x in ('v', 'wanted'))
         self._follow(drives[0].t, v)
@@ -133,7 +124,7 @@ class Tracker:
             return
         rows = np.atleast_2d(v)
         own = np.stack([one.moved(t, row) for one, row in zip(followers, rows, strict=True)])
-        moved, felt = self._inverse.moved(rows, own)
+        moved, felt = self.inverse.moved(rows, own)
         for one, *of_axis in zip(followers, rows, moved, felt, strict=True):
             one.drove(t, *of_axis)
 
@@ -174,8 +165,8 @@ class Tracker:
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
         self._each[0].take_over(successor)
-        if isinstance(self._inverse, LiveChains):
-            self._inverse.each[0] = successor.inverse
+        if isinstance(self.inverse, LiveChains):
+            self.inverse.each[0] = successor.inverse
 
 
 def _rows(of_axes: list[Array]) -> Array:

@@ -389,7 +389,8 @@ class FeedforwardNode(DrivingNode):
         }
         if (tracker := self._tracker) is not None:
             values['delay'] = f'{tracker.preview / self._rate_of_clock:.6g}'
-            values['passes'], values['expected'] = tracker.passes, f'{tracker.expected:.3g}'
+            values['passes'] = tracker.inverse.passes
+            values['expected'] = f'{tracker.inverse.error:.3g}'
             for tail, follower in zip(self._tails, tracker.followers, strict=False):
                 told = follower.corrector.told.items()
                 values |= {f'{name}{tail}': f'{x:.6g}' for name, x in told}

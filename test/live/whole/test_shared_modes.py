@@ -159,7 +159,7 @@ def test_coupled_axes_follow_their_references_nearly_as_by_the_offline_inverse()
     assert max(drive.errors.values()) < 0.005
     plain = replace(kind, model=pi.MultiAxisModel(kind.model.axes))
     assert rms(tracked(plain, wanted, stage=kind.model)[2]).min() > 5.0
-    assert tracker.passes > 2 and tracker.expected < 0.05
+    assert tracker.inverse.passes > 2 and tracker.inverse.error < 0.05
     assert kind.within_limits(v)
     # the end is played, then the stage ramps to rest
     assert np.abs(tracker.finish().wanted - wanted[:, -400:]).max() < 1e-15
