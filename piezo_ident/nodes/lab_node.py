@@ -52,8 +52,10 @@ MOST_FAILURES = 1000
 
 def guard_settings(values: Mapping[str, Any], sample_rate: float) -> GuardSettings:
     """Make the settings of a guard from the parameters of a node that drives."""
-    names = 'voltage_low', 'voltage_high', 'slew', 'ramp_slew', 'rest'
-    return GuardSettings(*(values[name] for name in names), sample_rate)
+    v = values
+    return GuardSettings(
+        v['voltage_low'], v['voltage_high'], v['slew'], v['ramp_slew'], v['rest'], sample_rate
+    )
 
 
 class LabNode(ParameterNode):
