@@ -188,13 +188,30 @@ class HysteresisInverse:
     """
     Inverse of H with its memory, block by block, in normalised units.
 
-    The voltage changes by at most `step` from one sample to the next, and stays within the given
-    `limits`, cut to the range in which H rises.  A lag before H has the `pole`: ``u(k) = pole
-    u(k-1) + (1 - pole) v(k)``.  The plays may grow with a power of the speed: `growth` has the
-    gain, stretch, lead and lead_stretch of `rate_dependent_hysteresis`.
+    Parameters
+    ----------
+    hysteresis : Hysteresis
+    limits : tuple of float, optional
+        Lowest and highest voltage.
+    step : float, optional
+        Largest change of the voltage from one sample to the next.
+    pole : float, optional
+        Pole of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
+    growth : array_like, shape (4,), optional
+        Growth of the plays with a power of the speed: gain, stretch, lead and lead_stretch of
+        `rate_dependent_hysteresis`.
 
-    The `hysteresis` that is inverted comes from `rising`, which raises a ModelError when H falls
-    somewhere under a rising voltage, within its span.
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+        H that is inverted, see `rising`.
+    limits : tuple of float
+        The given limits, cut to the range in which H rises.
+
+    Raises
+    ------
+    ModelError
+        When H falls somewhere under a rising voltage, within its span.
 
     Examples
     --------

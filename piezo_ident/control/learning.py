@@ -246,8 +246,12 @@ class SharedLearning(Learning):
     """
     A repeated motion of an axis, whose drives come from an inverse of all axes.
 
-    The model of the axis has scaling and modes.  After each `learn` the caller sets the next
-    `drive`.
+    Parameters
+    ----------
+    model : StageModel
+        Model of the axis, with scaling and modes.
+    drive : Inverse
+        First drive.  After each `learn` the caller sets the next one.
     """
 
     def __init__(self, model: StageModel, drive: Inverse) -> None:

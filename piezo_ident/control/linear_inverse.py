@@ -117,11 +117,22 @@ class Cut(NamedTuple):
 
 def cut(size: Array, last: float) -> tuple[float, Cut | None]:
     """
-    Cut off the ends of a filter; return the share of the ends, and None for too short a filter.
+    Cut off the ends of a filter.
 
-    The middle one of the taps, whose sizes are given, belongs to the present sample.  The ends are
-    the outer quarters; if they are empty, the filter has not wrapped around.  `last` is the share
-    of the ends in a filter half as long.
+    Parameters
+    ----------
+    size : ndarray, shape (n,)
+        Sizes of the taps; the middle one belongs to the present sample.
+    last : float
+        Share of the ends in a filter half as long.
+
+    Returns
+    -------
+    left : float
+        Share of the ends: the outer quarters.  If the ends are empty, the filter has not wrapped
+        around.
+    cut : Cut or None
+        The used taps, or None for too short a filter.
     """
     n = len(size)
     before, after = np.cumsum(size), np.cumsum(size[::-1])[::-1]
@@ -139,9 +150,19 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
     """
     Invert the linear and fast part of a model: G, the delay, and the effects that filter them.
 
-    The static gain of the filter is exact.  If an iteration with the whole model follows
-    (`iterated`), the filter may leave out poles that are too slow for `LONGEST` samples and hold
-    little of the static gain.  ModelError when G has no static gain, or needs a longer filter.
+    The static gain of the filter is exact.
+
+    Parameters
+    ----------
+    model : StageModel
+    iterated : bool, optional
+        Whether an iteration with the whole model follows.  The filter may then leave out poles
+        that are too slow for `LONGEST` samples, if they hold little of the static gain.
+
+    Raises
+    ------
+    ModelError
+        When G has no static gain, or needs a filter of more than `LONGEST` samples.
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):

@@ -52,7 +52,16 @@ TRIAL, SINES = 6000, ((2000.0, 0.3), (400.0, 0.08))
 
 
 class Driven(NamedTuple):
-    """Voltage for a block of a wanted motion [V], and where limits keep the model from it."""
+    """
+    The voltage for a block of a wanted motion.
+
+    Attributes
+    ----------
+    v : ndarray, shape (n,)
+        Voltage [V].
+    clipped : ndarray of bool, shape (n,)
+        Samples at which a limit keeps the model from the wanted motion.
+    """
 
     v: Array
     clipped: Mask
@@ -179,19 +188,29 @@ class LiveInverse:
 
     def recall(self, v: Array, t: Array) -> None:
         """
-        Run through a past voltage v [V] at the times t [s], shapes (n,), from rest.
+        Run through a past voltage, after which effects behind H are at rest.
 
-        Effects behind H are at rest afterwards.
+        Parameters
+        ----------
+        v, t : ndarray, shape (n,)
+            Voltage [V] and time [s]; the stage was at rest before the first sample.
         """
         for p in self._passes:
             p.recall(v, t)
 
     def follow(self, v: Array, tick: int = 0) -> None:
         """
-        Follow a voltage v [V], shape (n,), that another source has applied from a tick up to now.
+        Follow a voltage that another source has applied up to now.
 
         The displacement of the model under this voltage replaces the past of the wanted motion;
         `position` is its last value.  The next `preview` samples give no voltage yet.
+
+        Parameters
+        ----------
+        v : ndarray, shape (n,)
+            [V]
+        tick : int, optional
+            Clock of the voltage at the first sample [samples].
         """
         for p in self._passes:
             y = p.follow(v, tick)

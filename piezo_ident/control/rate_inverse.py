@@ -49,8 +49,18 @@ class RateInverse:
     """
     The inverse of H with `rate_dependent_hysteresis`, in normalised units.
 
-    H has no lags along the path, and the effect has the `parameters`.  The voltage stays within
-    the `limits`, and changes by at most `step` from one sample to the next.
+    Parameters
+    ----------
+    hysteresis : Hysteresis
+        Without lags along the path.
+    parameters : mapping
+        Parameters of the effect.
+    sample_rate : float
+        [Hz]
+    limits : tuple of float, optional
+        Lowest and highest voltage.
+    step : float, optional
+        Largest change of the voltage from one sample to the next.
 
     Examples
     --------

@@ -32,10 +32,14 @@ from piezo_ident.model.stream import Stream
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    Voltage `v` [V] for a block of a reference, and the `wanted` displacement at the times `t` [s].
+    Voltage for a block of a reference; several axes have a row each.
 
-    Several axes have a row each.  `clipped` counts the samples at which a limit keeps the stage
-    from the wanted displacement [m].
+    Attributes
+    ----------
+    t, v, wanted : ndarray, shape (n,)
+        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
+    clipped : int
+        Number of samples at which a limit keeps the stage from the wanted displacement.
     """
 
     t: Array
@@ -72,8 +76,12 @@ class AxisDrive:
     """
     Drives one axis by the voltage of an inverse; parameters and errors as for `Tracker`.
 
-    Begin with `reset`.  The `follower` corrects the goal by the measured error; it is None if
-    `follow` is ``'off'``.
+    Begin with `reset`.
+
+    Attributes
+    ----------
+    follower : Follower or None
+        Corrects the goal by the measured error; None if `follow` is ``'off'``.
     """
 
     def __init__(
@@ -176,6 +184,10 @@ class AxisDrive:
                 run = inverse.model.stream()
                 run.process(*past.recall(run, inverse.model, period)[::-1])
         return Successor(inverse, past.count, run)
+
+    def remembers(self, successor: Successor) -> bool:
+        """Return whether each sample of the voltage since a successor was made is still kept."""
+        return self._past.since(successor.count).size >= self.tick - successor.count
 
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""

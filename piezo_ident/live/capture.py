@@ -182,9 +182,13 @@ class Snapshot:
 
 class Capture:
     """
-    All blocks of all topics so far, at most the time `limit` [s].
+    All blocks of all topics so far.
 
-    A longer capture drops the oldest run of the sample clock, or the oldest tenth of a single run.
+    Parameters
+    ----------
+    limit : float, optional
+        Longest kept time [s].  A longer capture drops the oldest run of the sample clock, or the
+        oldest tenth of a single run.
     """
 
     def __init__(self, limit: float = 600.0) -> None:

@@ -26,14 +26,25 @@ class AxisComparison:
     """
     Residual, estimate and live errors of one axis.
 
-    `error` and `left` are the live errors of the prediction and of the estimate, over a time
-    `window` [s].  `publish` gets the name of a quantity, ``residual`` or ``estimate``, and a block
-    of it.  `tell` gets the corrections of the estimate by their names, and `note` a doubt about
-    the readings as text.  `knows` returns whether the run of the model knows the memory of its
-    plays.
+    Parameters
+    ----------
+    window : float
+        Time over which the live errors are taken [s].
+    corrector : Corrector
+    publish, tell, note : callable
+        Get the name of a quantity, ``residual`` or ``estimate``, and a block of it; the
+        corrections of the estimate by their names; a doubt about the readings as text.
+    knows : callable
+        Returns whether the run of the model knows the memory of its plays.
 
-    In the last second, `again` samples of displacement were repeated or late, and the voltage was
-    `room` away from the ends of the range of the model [V].
+    Attributes
+    ----------
+    error, left : LiveError
+        Live errors of the prediction and of the estimate.
+    again : int
+        Repeated or late samples of displacement in the last second.
+    room : float or None
+        Distance of the voltage of the last second from the ends of the range of the model [V].
     """
 
     def __init__(

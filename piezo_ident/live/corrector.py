@@ -62,8 +62,14 @@ class Estimated:
     """
     A block of the estimate, with the state of the observer at its samples.
 
-    The `corrections` are the numbers of `CORRECTIONS`, `rate` times a second of the stream.  The
-    block `is_settled` if the band of unknown plays stays the same over it, see `SETTLED`.
+    Attributes
+    ----------
+    samples : Samples
+    seen : Observed
+    corrections : list of dict
+        The numbers of `CORRECTIONS`, `rate` times a second of the stream.
+    is_settled : bool
+        Whether the band of unknown plays stays the same over the block, see `SETTLED`.
     """
 
     samples: Samples
@@ -84,11 +90,24 @@ class _Block:
 
 class Corrector:
     """
-    Corrects predictions by displacement of at least a `horizon` before [samples].
+    Corrects predictions by displacement of at least a horizon before.
 
-    The corrector can follow the `gain`, too, also as one that drifts (`drift`).  It learns the
-    part `adapt` of the model; the observer then corrects the free run of the learnt model.  `told`
-    holds the corrections published last, at a `rate` per second of the stream.
+    Parameters
+    ----------
+    horizon : int, optional
+        [samples]
+    gain, drift : bool, optional
+        Whether the gain is followed, too, and whether as one that drifts.
+    rate : float, optional
+        Corrections published per second of the stream.
+    adapt : {'off', 'gain', 'hysteresis'}, optional
+        Part of the model that the corrector learns.  The observer then corrects the free run of
+        the learnt model.
+
+    Attributes
+    ----------
+    told : dict
+        The corrections published last.
     """
 
     def __init__(

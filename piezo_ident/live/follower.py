@@ -49,11 +49,25 @@ class _Known(NamedTuple):
 
 class Follower:
     """
-    Corrects a wanted motion by the measured error of the stage, with or without the `gain`.
+    Corrects a wanted motion by the measured error of the stage.
 
-    The correction changes by at most `step` from one sample to the next [m].  The `stream` has run
-    the model up to the `tick` of the next voltage; it is `known` to have the memory of the plays.
-    `is_limited` says whether the last correction was as large as it may be.
+    Parameters
+    ----------
+    model : StageModel
+    gain : bool
+        Whether the gain is corrected, too.
+    step : float
+        Largest change of the correction from one sample to the next [m].
+    stream, tick : Stream, int
+        A run of the model up to now, and the next tick of the voltage.
+    known : bool
+        Whether that run has the memory of the plays.
+
+    Attributes
+    ----------
+    corrector : Corrector
+    is_limited : bool
+        Whether the last correction was as large as it may be.
     """
 
     def __init__(

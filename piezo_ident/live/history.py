@@ -129,7 +129,14 @@ class TurningPoints:
 
 
 class History:
-    """Voltage since the start of a run, of `count` samples: turning points, and last seconds."""
+    """
+    Voltage since the start of a run: its turning points, and its last seconds in full.
+
+    Attributes
+    ----------
+    count : int
+        Samples so far.
+    """
 
     def __init__(self) -> None:
         self._old = TurningPoints()

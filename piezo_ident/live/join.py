@@ -47,9 +47,14 @@ class Join:
     """
     Blocks of the first axis, each of which waits for the other axes at the same times.
 
-    The topics of the further axes end in `tails`, such as ``_b``.  Before their first sample these
-    axes have the values `rest`, or zero.  The clock of the stream has the `sample_rate` [Hz] or a
-    lower one.
+    Parameters
+    ----------
+    tails : sequence of str
+        Ends of the topics of the further axes, such as ``_b``.
+    sample_rate : float, optional
+        Rate of the clock of the stream, or a higher rate [Hz].
+    rest : sequence of float, optional
+        Values of the further axes before their first sample.  Default: zero.
 
     Examples
     --------
@@ -61,9 +66,6 @@ class Join:
     >>> ((samples, *_),) = join.complete(is_over=lambda since: False)
     >>> join.rows(samples)[0].values.tolist()
     [[1.0, 2.0], [3.0, 4.0]]
-    >>> join.add('_b', Samples(t + 0.2, np.array([5.0, 6.0])), since=0.2)
-    >>> join.take('_b', t + 0.3).tolist()
-    [6.0, nan]
     """
 
     def __init__(

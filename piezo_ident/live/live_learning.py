@@ -110,8 +110,16 @@ class Learner:
     """
     Plays the repetitions that a `LiveLearning` plans, at `most` so many.
 
-    A thread calls `make` for the plan `learning`, which is None before.  `play` gets a block of
-    voltage and one of wanted displacement.  `text` tells the progress to people.
+    A thread calls `make` for the plan.  `play` gets a block of voltage and one of wanted
+    displacement.
+
+    Attributes
+    ----------
+    learning : LiveLearning or None
+        None until it is made.
+    text : str
+        Progress, for people.
+    is_over : bool
     """
 
     def __init__(

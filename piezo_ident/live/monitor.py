@@ -70,8 +70,14 @@ class Matcher:
     Joins two streams of blocks on time, in any order and with blocks of any size.
 
     A restarted clock repeats the times of the old run, so a block waits until the other stream has
-    restarted, too.  In time, `unmatched` measured samples had no prediction, and `unmeasured`
-    predicted samples no measured one.
+    restarted, too.
+
+    Attributes
+    ----------
+    unmatched : int
+        Measured samples without a prediction in time.
+    unmeasured : int
+        Predicted samples without a measured one in time.
     """
 
     def __init__(self) -> None:

@@ -18,12 +18,23 @@ class Schedule:
     """
     Schedule of a stream, counted from its start so that it cannot drift.
 
-    Position 0 is due at `start`, on a monotonic clock [s].  `speed` is the progress per second:
-    samples, or seconds of a recording.  A delay of a block above `slip` [s] is not made up; it
-    moves the rest of the schedule.
+    Parameters
+    ----------
+    speed : float
+        Progress per second: samples, or seconds of a recording.
+    start : float
+        When position 0 is due, on a monotonic clock [s].
+    slip : float, optional
+        Largest delay that is made up; a larger one moves the rest of the schedule [s].
 
-    Of the blocks `sent`, `late` ones were sent after the next block was due; the `worst` delay and
-    the sum of the moves, `slipped`, are in s.
+    Attributes
+    ----------
+    sent, late : int
+        Number of blocks, and number of blocks sent after the next block was due.
+    worst : float
+        Largest delay of a block [s].
+    slipped : float
+        Time by which long delays have moved the schedule [s].
 
     Examples
     --------

@@ -50,8 +50,18 @@ class AxesRun:
     Run of a model, with a row of voltages and of displacements for each axis.
 
     A coupled axis runs twice: alone, for the motion by its own voltage, and with the motions of
-    the other axes.  `axes` gives the order of the rows, by the names of all displacements.  `felt`
-    is the motion by other axes in the last displacements [m], shape (k, n).
+    the other axes.
+
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    axes : sequence of str
+        Order of the rows, by the names of the displacements; all axes of the model.
+
+    Attributes
+    ----------
+    felt : ndarray, shape (k, n)
+        Motion by other axes in the last displacements [m].
 
     Examples
     --------
@@ -115,12 +125,25 @@ def check_axes(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> None:
 
 class Predictor:
     """
-    Predicts the displacement as blocks of voltage come, with a row for each of several `axes`.
+    Predicts the displacement as blocks of voltage come.
 
-    `problem` is the last problem of the stream; empty without one.  `clock` counts lost and late
-    samples, and restarts.  `half_width` is that of the band of the last block [m], which holds the
-    share `level` of the errors; None if the model carries no band.  `felt` is the motion by other
-    axes in the last prediction [m], shape (k, n).
+    Parameters
+    ----------
+    axes : sequence of str, optional
+        Names of the displacements; blocks of several axes have a row for each.
+    level : float, optional
+        Share of the errors that the band holds.
+
+    Attributes
+    ----------
+    problem : str
+        The last problem of the stream; empty without one.
+    clock : BlockClock
+        Counts lost and late samples, and restarts.
+    half_width : Samples or None
+        Half width of the band of the last block [m]; None if the model carries no band.
+    felt : ndarray, shape (k, n)
+        Motion by other axes in the last prediction [m].
     """
 
     def __init__(self, axes: Sequence[str] = ('y',), level: float = LEVEL) -> None:

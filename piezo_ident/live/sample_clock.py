@@ -75,10 +75,19 @@ class Verdict:
 
 class SampleClock:
     """
-    Tracks the sample clock of one stream, of a `sample_rate` [Hz].
+    Tracks the sample clock of one stream.
 
-    A gap above `longest_gap` [s] begins a new stream.  `head` is the next expected tick; None
-    before a stream begins and while it is silent.
+    Parameters
+    ----------
+    sample_rate : float
+        [Hz]
+    longest_gap : float
+        Longest gap within a stream; a longer gap begins a new stream [s].
+
+    Attributes
+    ----------
+    head : int or None
+        Next expected tick; None before a stream begins and while it is silent.
 
     Examples
     --------
@@ -133,10 +142,14 @@ class SampleClock:
         """
         Decide how the next block relates to the stream.
 
-        `sequence` is the number that its publisher gave the message; None if the middleware does
-        not tell.  `publishers` returns the ids (gids) of all publishers of the topic; no ids mean
-        one publisher.  It is called only if a block does not go on, or if others were present at
-        the start.
+        Parameters
+        ----------
+        samples : Samples
+        sequence : int, optional
+            Number that its publisher gave the message; None if the middleware does not tell.
+        publishers : callable, optional
+            Returns the ids (gids) of all publishers of the topic; no ids mean one publisher.
+            Called only if a block does not go on, or if others were present at the start.
         """
         ticks, reason = self._ticks(samples.t)
         if reason:
@@ -261,9 +274,14 @@ class BlockClock:
     """
     Clock of a stream: tells whether a block goes on, skips samples, came before, or starts over.
 
-    `begin` and `last` are the times of the first sample since the last restart, and of the newest
-    one [s]; `period` is the sampling period [s].  `lost` samples never came, `late` ones came
-    again or out of turn, and the clock made `restarts`.
+    Attributes
+    ----------
+    begin, last : float
+        Time of the first sample since the last restart, and of the newest one [s].
+    period : float
+        Sampling period [s].
+    lost, late, restarts : int
+        Samples that never came, samples that came again or out of turn, restarts of the clock.
 
     Examples
     --------

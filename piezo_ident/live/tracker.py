@@ -32,15 +32,32 @@ from piezo_ident.record.blocks import Samples
 
 class Tracker:
     """
-    Follows the reference of a stage with a model, `preview` samples later.
+    Follows the reference of a stage with a model.
 
-    The stage is at rest before the first block.  Arrays of several axes have a row for each of
-    `axes`, the names of the displacements.  The `settings` hold for each axis, at the rate of the
-    model.  The `inverse` makes the voltages; an axis without one within these limits raises the
-    errors of `LiveInverse`.
+    The stage is at rest before the first block.  Arrays of several axes have a row for each axis.
 
-    `follow` chooses the corrections of each axis by its measured displacement: none (``'off'``),
-    offset and creep from earlier motion (``'offset'``), or these and the gain (``'gain'``).
+    Parameters
+    ----------
+    model : StageModel or MultiAxisModel
+    settings : GuardSettings
+        Limits and slew of each axis, at the rate of the model.
+    preview : int, optional
+        Samples by which the stage follows the reference later.
+    follow : {'off', 'offset', 'gain'}, optional
+        Corrections of each axis by its measured displacement: none, offset and creep from earlier
+        motion, or these and the gain of the axis.
+    axes : sequence of str, optional
+        Order of the rows, by the names of the displacements.
+
+    Attributes
+    ----------
+    inverse : LiveChains or LiveModesInverse
+        Makes the voltages.
+
+    Raises
+    ------
+    DataError, ModelError
+        When an axis has no inverse within these limits; see `LiveInverse`.
 
     Examples
     --------
@@ -103,10 +120,21 @@ class Tracker:
 
     def process(self, reference: ArrayLike, restarted: bool = False) -> Drive:
         """
-        Make the voltage for the next samples of a reference [m], shape (n,), or (k, n) for k axes.
+        Make the voltage for the next samples of a reference.
 
-        Each sample of voltage belongs to the reference `preview` samples before.  A sample that is
-        NaN or infinite repeats the last sample.  A stream that was `restarted` has to be joined.
+        A sample that is NaN or infinite repeats the last sample.
+
+        Parameters
+        ----------
+        reference : array_like, shape (n,), or (k, n) for k axes
+            [m]
+        restarted : bool, optional
+            Whether a new stream begins here, which has to be joined.
+
+        Returns
+        -------
+        Drive
+            As many samples of voltage; each belongs to the reference `preview` samples before.
         """
         each = self._each
         rows = zip(each, np.atleast_2d(reference), strict=True)
@@ -162,6 +190,10 @@ class Tracker:
         """Bring a model into the state after the voltage so far; any thread may call this."""
         return self._each[0].successor(model)
 
+    def remembers(self, successor: Successor) -> bool:
+        """Return whether each sample of the voltage since a successor was made is still kept."""
+        return self._each[0].remembers(successor)
+
     def take_over(self, successor: Successor) -> None:
         """Go on with another model, from the position that it predicts."""
         self._each[0].take_over(successor)
@@ -190,7 +222,12 @@ def prepared(
     Prepare another model for the axes of a node; any thread may call this.
 
     A model of one axis becomes the successor of the tracker at work, `now`, if that one has the
-    same settings.  ModelError when the model has other axes.
+    same settings.
+
+    Raises
+    ------
+    ModelError
+        When the model has other axes.
     """
     check_axes(model, axes)
     if not axes[1:]:

@@ -171,9 +171,7 @@ class FeedforwardNode(DrivingNode):
         tracker = self._tracker
         if isinstance(new, Successor):
             # the voltage is kept sample by sample for some seconds
-            return tracker is None or tracker.past().since(new.count).size < (
-                tracker.tick - new.count
-            )
+            return tracker is None or not tracker.remembers(new)
         return (new.settings, new.follow) != (self._settings(), self.values['follow'])
 
     # services

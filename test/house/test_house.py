@@ -53,7 +53,7 @@ SIZES = {
     'common': (1000, 8),
     'excitation': (1100, 6),
     'identification': (4400, 18),
-    'live': (3600, 16),
+    'live': (3800, 16),
     'many': (800, 6),
     'nodes': (4000, 18),
     'nodes/identifier': (1400, 7),

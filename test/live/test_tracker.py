@@ -106,6 +106,15 @@ def test_another_model_takes_over_without_a_glitch(seconds):
     np.testing.assert_allclose(wanted[-4000:], reference[-4400:-400], atol=1e-12)
 
 
+def test_a_successor_that_comes_too_late_is_told():
+    tracker = Tracker(PAPER, SETTINGS)
+    successor = tracker.successor(PAPER)
+    tracker.idle(40_000, 0.0)
+    assert tracker.remembers(successor)
+    tracker.idle(160_000, 0.0)
+    assert not tracker.remembers(successor)
+
+
 def test_before_the_first_block_a_model_is_merely_replaced():
     tracker = Tracker(PAPER, SETTINGS)
     tracker.take_over(tracker.successor(CREEP))

@@ -392,8 +392,7 @@ def test_a_model_that_was_prepared_for_earlier_limits_is_prepared_again():
 @pytest.mark.parametrize(('count', 'wishes'), [(99, [('topic model', 'new')]), (100, [])])
 def test_a_model_that_was_prepared_before_the_kept_voltage_is_prepared_again(count, wishes):
     node, taken = Idle(), []
-    past = SimpleNamespace(since=lambda n: np.zeros(min(100, 200 - n)))
-    node._tracker.tick, node._tracker.past = 200, lambda: past
+    node._tracker.remembers = lambda new: new.count >= 100
     node._tracker.take_over = taken.append
     node._take_model(('new', Successor(None, count)), 'topic model')
     assert node.wishes == wishes and len(taken) == (not wishes)

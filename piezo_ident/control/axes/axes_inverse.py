@@ -59,11 +59,25 @@ def static_gain(G: Modal, spans: Array) -> Array:
 
 def inverse_filters(G: Modal, spans: Array, least: float) -> tuple[AxesFilter, AxesFilter]:
     """
-    Invert a linear model of several axes where its gain is not small; return Q, and P = G Q.
+    Invert a linear model of several axes where its gain is not small.
 
-    The static gains of both are exact.  Errors of the axes are compared by the displacements
-    `spans` [m].  G is not inverted below the share `least` of its static gain.  ModelError when
-    the static gain has no inverse, or the filter needs more than `LONGEST` samples.
+    Parameters
+    ----------
+    G : Modal
+    spans : ndarray, shape (axes,)
+        Displacements by which errors of the axes are compared [m].
+    least : float
+        Share of the static gain below which G is not inverted.
+
+    Returns
+    -------
+    Q, P : AxesFilter
+        The inverse, and G Q.  Their static gains are exact.
+
+    Raises
+    ------
+    ModelError
+        When the static gain has no inverse, or the filter needs more than `LONGEST` samples.
     """
     static = static_gain(G, spans)
     n, left = SHORTEST, np.inf

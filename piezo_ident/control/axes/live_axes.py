@@ -30,8 +30,14 @@ class LiveChains:
     """
     Inverses of the chains of all axes; arrays have a row for each axis.
 
-    The `model` holds the paths.  The names of the displacements, `axes`, give the order of the
-    rows and of the inverses `each`, which may be replaced.
+    Parameters
+    ----------
+    each : list of LiveInverse
+        Inverse of each axis.  An inverse may be replaced.
+    model : StageModel or MultiAxisModel
+        The model with the paths.
+    axes : sequence of str
+        Order of the rows, by the names of the displacements.
     """
 
     def __init__(

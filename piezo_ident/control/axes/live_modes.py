@@ -57,10 +57,34 @@ class LiveModesInverse:
     """
     The inverse of shared modes, block by block; arrays have a row for each axis.
 
-    Parameters, attributes and errors are those of `LiveInverse`, for each axis.  The names of the
-    displacements, `axes`, give the order of the rows.  The `error` is that of the worst axis on a
-    trial of all axes at once; modes that run away on it raise a ModelError.  `models` are those of
-    the axes beside the modes, with scaling and known errors.
+    Before the first block the stage rests under the voltage `rest`, and the wanted motions rest at
+    `position`.  Each sample of the wanted motions gives one sample of the voltages.  The stage
+    reaches the wanted displacements `preview` samples later.
+
+    Parameters
+    ----------
+    model : MultiAxisModel
+        With shared modes.
+    axes : sequence of str
+        Order of the rows, by the names of the displacements.
+    limits, slew, preview, rest
+        As for `LiveInverse`, for each axis.
+
+    Attributes
+    ----------
+    preview, passes, error, warnings
+        As of `LiveInverse`; the error is that of the worst axis on a trial of all axes at once.
+    position : ndarray, shape (k,)
+        Displacements of the stage at rest [m].
+    models : list of StageModel
+        Models of the axes beside the modes, with scaling and known errors.
+
+    Raises
+    ------
+    DataError
+        When the limits are crossed, or rest lies outside of them.
+    ModelError
+        When the modes have no inverse, or run away on the trial motion.
     """
 
     def __init__(
@@ -159,9 +183,24 @@ class LiveModesInverse:
 
     def process(self, wanted: Array) -> Driven:
         """
-        Compute as many voltages for the next samples of the wanted motions [m], shape (k, n).
+        Compute the voltages for the next samples of the wanted motions.
 
-        DataError for other shapes and no finite numbers, ModelError for modes that run away.
+        Parameters
+        ----------
+        wanted : ndarray, shape (k, n)
+            Displacements [m].
+
+        Returns
+        -------
+        Driven
+            As many samples.
+
+        Raises
+        ------
+        DataError
+            When the wanted motions are no finite numbers.
+        ModelError
+            When the modes run away.
         """
         fits = wanted.ndim == 2 and len(wanted) == self._rows.size and wanted.size
         if not fits or not np.isfinite(wanted).all():

@@ -81,10 +81,29 @@ def invert_modes(
     """
     Find the voltages under which shared modes move all axes as wanted; see `piezo_ident.invert`.
 
-    `limits`, `slew`, `clip` and `sample_rate` are those of `piezo_ident.control.inverse.invert`,
-    for each axis; `like` is not used.  All results begin with the same sample.  DataError when the
-    limits do not reach the wanted motion, ModelError when the modes lack an inverse, or the
-    iteration does not contract.
+    Parameters
+    ----------
+    model : MultiAxisModel
+    modes : SharedModes
+        Shared modes of the model.
+    wanted : mapping of str to ndarray, shape (n,)
+        Displacement by axis [m].
+    limits, slew, clip, sample_rate
+        As for `piezo_ident.control.inverse.invert`, for each axis.
+    like : object, optional
+        Not used.
+
+    Returns
+    -------
+    dict of str to Inverse
+        All begin with the same sample.
+
+    Raises
+    ------
+    DataError
+        When the limits do not reach the wanted motion.
+    ModelError
+        When the modes lack an inverse, or the iteration does not contract.
     """
     check_rate(model.sample_rate, sample_rate)
     task = _Task(model, modes, wanted, limits, slew, clip)
