@@ -64,12 +64,10 @@ def played(model: StageModel, name: str, earlier: ArrayLike = ()) -> Record:
 
 @cache
 def measured(name: str = 'val.npz') -> Record:
-    """Return a record of the stage that creeps."""
     return played(refined_model(), name)
 
 
 def errors(record: Record, residual: np.ndarray) -> Errors:
-    """Return the errors of the one piece of a record."""
     (piece,) = record.pieces
 
     def percent(e: np.ndarray) -> float:

@@ -52,7 +52,6 @@ def spring():
 
 
 def diagnosed(model, u, y):
-    """Diagnose the record of a force and a displacement."""
     record = pi.Record.from_arrays(u, y, sample_rate=study.RATE, name='spring')
     return pi.diagnose(model, [record], CANDIDATES)
 

@@ -30,14 +30,12 @@ def fit(left, kinds=None, size=3, retuning=(), name='creep'):
 
 
 def found(*names, left, way='wide', chance=0.0, before=WHOLE, **how):
-    """Return a candidate with some effects."""
     this = SimpleNamespace(before=fit(before), chance={names[-1]: chance})
     own = fit(left, name=names[-1], **how)
     return FittedSet(tuple(sorted(names)), way, own, this)
 
 
 def without(left=WHOLE, way='wide', **how):
-    """Return a candidate without effects."""
     return FittedSet((), way, fit(left, **how))
 
 
@@ -92,24 +90,17 @@ def test_beside_another_effect_kinds_of_motion_alone_speak_for_none(given):
 
 
 def test_a_pair_is_found_where_no_single_one_is(given):
-    alone = given.and_these(
-        [found('creep', left=0.6 * WHOLE), found('backlash', left=0.7 * WHOLE)]
-    )
-    assert taken(alone) == ()
-    assert taken(alone.and_these([found('creep', 'backlash', left=0.1 * WHOLE)])) == (
-        'backlash',
-        'creep',
-    )
+    alone = [found('creep', left=0.6 * WHOLE), found('backlash', left=0.7 * WHOLE)]
+    assert taken(given.and_these(alone)) == ()
+    both = [*alone, found('creep', 'backlash', left=0.1 * WHOLE)]
+    assert taken(given.and_these(both)) == ('backlash', 'creep')
 
 
 def test_of_those_alike_the_one_with_fewest_parameters_is_taken(given):
     rich = found('creep', left=0.02 * WHOLE, size=9)
-    assert taken(given.and_these([rich, found('backlash', left=0.025 * WHOLE, size=1)])) == (
-        'backlash',
-    )
-    assert taken(given.and_these([rich, found('backlash', left=0.03 * WHOLE, size=1)])) == (
-        'creep',
-    )
+    for left, name in ((0.025, 'backlash'), (0.03, 'creep')):
+        both = given.and_these([rich, found('backlash', left=left * WHOLE, size=1)])
+        assert taken(both) == (name,)
 
 
 @pytest.mark.parametrize(('times', 'names'), [(1.5, ('creep', 'thermal_drift')), (1.7, ())])

@@ -18,11 +18,7 @@ from diagnosis_examples import played, with_effects
 from diagnosis_examples import refined_model as creeping_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ConfigError, IdentificationError
-from piezo_ident.diagnosis import (
-    diagnose,
-    DiagnosisSettings,
-    search,
-)
+from piezo_ident.diagnosis import diagnose, DiagnosisSettings, search
 from piezo_ident.diagnosis import rows as rows_module
 from piezo_ident.diagnosis.base_residual import base_residual, prepared
 from piezo_ident.diagnosis.equations import held_out_errors, normal_equations
@@ -69,9 +65,13 @@ def responded(stage, v, channels=None, every=EVERY, **settings):
     return stage.respond(t, np.repeat(v, every), channels=fine, **settings)[::every]
 
 
-@cache
 def measured(effect, size, seed, every=EVERY):
     """Return model, a record to diagnose and one that nothing saw."""
+    return measured_once(effect, size, seed, every)
+
+
+@cache
+def measured_once(effect, size, seed, every):
     rate = TRUTH_RATE / every
 
     def other(t, number):
@@ -98,13 +98,18 @@ def measured(effect, size, seed, every=EVERY):
     return model.model, *records
 
 
+def plain(seed=1, every=EVERY):
+    """Return the model and the record of a stage without an effect."""
+    model, record, _ = measured(None, 0.0, seed, every)
+    return model, record.pieces[0]
+
+
 #: a search among a few candidates takes seconds
 FEW = DiagnosisSettings(effects=('creep', 'thermal_drift', 'periodic_disturbance'))
 
 
 @cache
 def diagnosed(effect, size, seed, settings=None, every=EVERY):
-    """Return a diagnosis that several tests look at."""
     model, record, _ = measured(effect, size, seed, every)
     return diagnose(model, record, settings)
 
@@ -150,12 +155,6 @@ def test_of_a_long_record_a_stated_part_is_searched_and_fitted():
     assert (part.sentence, part.after) == (result.sentence, result.after)
 
 
-def test_a_part_that_is_too_short_is_refused_with_its_length():
-    model, record, _ = measured(None, 0.0, 1)
-    with pytest.raises(IdentificationError, match=r'1,000 of .* were searched.*--most-samples'):
-        diagnose(model, record, DiagnosisSettings(most_samples=1000))
-
-
 def test_a_setting_of_another_type_is_refused():
     with pytest.raises(ConfigError, match=r'most_effects must be a whole number, got 1\.5'):
         DiagnosisSettings(most_effects=1.5)
@@ -180,25 +179,20 @@ def test_of_records_the_beginnings_are_taken_in_proportion(most):
     assert diagnose_module._beginnings(model, whole, 7000) == whole
 
 
-def test_effect_outside_the_catalogue_stays_unexplained():
-    model, record, unseen = measured('floor_vibration', 0.3, 1, every=4)
+@pytest.mark.parametrize(
+    ('effect', 'size', 'seed', 'every', 'verdict'),
+    [('floor_vibration', 0.3, 1, 4, 'unexplained'), (None, 0.0, 2, EVERY, 'none')],
+)
+def test_without_an_effect_of_the_catalogue_none_is_added(effect, size, seed, every, verdict):
+    model, record, unseen = measured(effect, size, seed, every)
     result = diagnose(model, record)
-    assert result.verdict == 'unexplained', result.sentence
-    assert not result.effects
-    assert result.unexplained.rms_percent > 0.1
+    assert (result.verdict, result.effects) == (verdict, ()), result.sentence
+    if effect:
+        assert result.unexplained.rms_percent > 0.1
+    else:
+        assert result.smallest_detectable >= 0.05 and result.before.overall < 0.3
     # a refit of H may help; nothing else was added
     assert result.after.overall <= result.before.overall
-    before, after = unseen_errors(result, unseen)
-    assert after < 1.05 * before
-
-
-def test_no_effect_is_none():
-    model, record, unseen = measured(None, 0.0, 2)
-    result = diagnose(model, record)
-    assert result.verdict == 'none', result.sentence
-    assert not result.effects
-    assert result.smallest_detectable >= 0.05
-    assert result.after.overall <= result.before.overall < 0.3
     before, after = unseen_errors(result, unseen)
     assert after < 1.05 * before
 
@@ -330,27 +324,29 @@ def test_what_a_wider_hysteresis_imitates_may_hide_in_it():
     assert max(unseen_errors(result, unseen)) < 0.1
 
 
-def with_another_h(bend=0.05):
+def with_another_h(bend, gain=1.0, seed=1):
     """Return the model of a stage, and a record of it whose displacement is bent."""
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
-    bent = replace(piece, y=piece.y * (1.0 + bend - bend * piece.y / piece.y.max()))
+    model, piece = plain(seed)
+    bent = replace(piece, y=piece.y * (gain + bend - bend * piece.y / piece.y.max()))
     return model, Record((bent,), 'bent')
 
 
-@pytest.mark.parametrize('has_labels', [True, False])
-def test_where_nothing_is_missing_a_refit_of_h_is_told(has_labels):
-    model, bent = with_another_h(0.008)
+@pytest.mark.parametrize(
+    ('bend', 'gain', 'seed', 'has_labels', 'left'),
+    # a gain of 1.02 would take most of the last, and H as it is now takes nearly all
+    [(0.008, 1.0, 1, True, 0.5), (0.008, 1.0, 1, False, 0.5), (0.04, 1.02, 2, True, 0.1)],
+)
+def test_where_nothing_is_missing_a_refit_of_h_is_told(bend, gain, seed, has_labels, left):
+    model, bent = with_another_h(bend, gain, seed)
     if not has_labels:
         bent = Record((replace(bent.pieces[0], segments=()),), 'unlabelled')
     result = diagnose(model, bent, FEW)
     assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
-    assert result.after.overall < 0.5 * result.before.overall
+    assert result.after.overall < left * result.before.overall
 
 
 def test_another_gain_is_no_other_hysteresis():
-    model, record, _ = measured(None, 0.0, 2, every=4)
-    (piece,) = record.pieces
+    model, piece = plain(2, every=4)
     larger = Record((replace(piece, y=1.02 * piece.y),), 'larger')
     result = diagnose(model, larger, FEW)
     assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
@@ -363,20 +359,9 @@ def test_another_gain_is_no_other_hysteresis():
     assert result.after.overall < 0.2 * result.before.overall
 
 
-def test_another_loop_is_not_taken_for_another_gain():
-    model, record, _ = measured(None, 0.0, 2)
-    (piece,) = record.pieces
-    bent = Record((replace(piece, y=piece.y * (1.06 - 0.04 * piece.y / piece.y.max())),), 'bent')
-    result = diagnose(model, bent, FEW)
-    # a gain of 1.02 takes most of it, and H as it is now nearly all
-    assert (result.verdict, result.effects) == ('refitted', ()), result.sentence
-    assert result.after.overall < 0.1 * result.before.overall
-
-
 def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
     # H with another gain is the same model, so that the first could be any: it was -0.57 here
-    model, record, _ = measured(None, 0.0, 2)
-    (piece,) = record.pieces
+    model, piece = plain(2)
     # the end of the first sine, so that the first of it follows from no known start
     late = piece.cut(int(0.13 * piece.n), piece.n)
     gains = 1.0 + 0.03 * np.linspace(0.0, 1.0, late.n)
@@ -390,8 +375,7 @@ def test_a_gain_that_drifts_is_counted_from_where_the_data_begin():
 
 def test_a_gain_that_has_changed_before_a_record_begins_is_given():
     # the H as given stays, so that it makes up for no other gain
-    model, record, _ = measured(None, 0.0, 2)
-    (piece,) = record.pieces
+    model, piece = plain(2)
 
     def wandering(name, *gains):
         gain = 1.0 + np.linspace(*gains, piece.n)
@@ -422,8 +406,7 @@ def test_a_refit_beside_a_gain_that_wanders_has_the_given_gain():
 
 
 def test_a_gain_drifts_by_the_clock_that_the_model_has_already():
-    model, record, _ = measured(None, 0.0, 2)
-    (piece,) = record.pieces
+    model, piece = plain(2)
     rate = {'rate': 1e-4, 'amplitude': 0.0, 'time_constant': 60.0}
     drifting = replace(model, effects=(EffectSetting('thermal_drift', rate),))
     # the time of the clock goes on from an earlier record
@@ -536,7 +519,6 @@ def test_a_candidate_that_is_left_out_is_not_named():
 
 
 def test_every_step_can_be_cancelled():
-    model, record, _ = measured(None, 0.0, 1)
     for step in ('residual', 'candidates', 'verdict'):
 
         def progress(name, share, step=step):
@@ -544,22 +526,31 @@ def test_every_step_can_be_cancelled():
                 raise Cancelled(name)
 
         with pytest.raises(Cancelled, match=step):
-            diagnose(model, record, FEW, progress=progress)
+            diagnose(slow_model(), example_record(), ONLY_CREEP, progress=progress)
 
 
 # -- refusals ----------------------------------------------------------------------------------
 
 
-def test_another_rate_and_too_little_are_refused():
+REFUSALS = {
+    'sampled': lambda p: Piece(p.v[::2], p.y[::2], RATE / 2),
+    'longer': lambda p: p.cut(0, 125),
+    r'1,000 of .* were searched.*--most-samples': lambda p: p,
+    'changed: the displacement does not follow': lambda p: replace(
+        p, y=1e-6 * np.random.default_rng(1).standard_normal(p.n)
+    ),
+    r'changed: .* runs against .* a sign reversed': lambda p: replace(p, y=-p.y),
+}
+
+
+@pytest.mark.parametrize('reason', REFUSALS)
+def test_what_cannot_be_diagnosed_is_refused(reason):
     model, record, _ = measured(None, 0.0, 1)
-    piece = record.pieces[0]
-    slow = Record((Piece(piece.v[::2], piece.y[::2], RATE / 2),), 'slow')
+    settings = replace(ONLY_CREEP, most_samples=1000) if 'most' in reason else ONLY_CREEP
+    with pytest.raises(IdentificationError, match=reason):
+        diagnose(model, Record((REFUSALS[reason](record.pieces[0]),), 'changed'), settings)
     with pytest.raises(IdentificationError, match='no record was given'):
         diagnose(model, [])
-    with pytest.raises(IdentificationError, match='sampled'):
-        diagnose(model, slow)
-    with pytest.raises(IdentificationError, match='longer'):
-        diagnose(model, Record((piece.cut(0, 125),), 'short'))
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
@@ -586,26 +577,8 @@ def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatc
     assert any('was not judged' in warning for warning in result.warnings)
 
 
-def test_displacement_that_does_not_follow_the_voltage_is_no_stage():
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
-    noise = 1e-6 * np.random.default_rng(1).standard_normal(piece.n)
-    unplugged = Record((replace(piece, y=noise),), 'unplugged')
-    with pytest.raises(IdentificationError, match='unplugged: the displacement does not follow'):
-        diagnose(model, unplugged, ONLY_CREEP)
-
-
-def test_displacement_that_runs_against_the_model_is_refused():
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
-    turned = Record((replace(piece, y=-piece.y),), 'turned')
-    with pytest.raises(IdentificationError, match=r'turned: .* runs against .* a sign reversed'):
-        diagnose(model, turned, FEW)
-
-
 def test_columns_that_may_be_swapped_are_said():
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
+    model, piece = plain()
     noise = 1e-3 * np.random.default_rng(1).standard_normal(piece.n)
     y = 5e-6 * np.round(piece.v * 40.0) / 40.0
     y[np.arange(piece.n) % 500 < 250] = 0.0
@@ -616,8 +589,7 @@ def test_columns_that_may_be_swapped_are_said():
 
 
 def test_voltages_that_the_model_does_not_know_are_said():
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
+    model, piece = plain()
     found = diagnose(model, Record((replace(piece, v=1e3 * piece.v),), 'scaled'), ONLY_CREEP)
     (heard,) = [w for w in found.warnings if w.startswith('scaled: ')]
     assert 'extrapolation' in heard
@@ -673,8 +645,7 @@ def test_time_begins_with_the_record_whatever_its_clock_says():
 
 
 def test_where_no_labels_tell_kinds_the_voltage_does():
-    model, record, _ = measured(None, 0.0, 1, every=4)
-    (piece,) = record.pieces
+    model, piece = plain(every=4)
     rows = make_rows(model, [Record((replace(piece, segments=()),), 'unlabelled')])
     named = replace(piece, segments=(Segment('triangle', 0, piece.n),))
     one = make_rows(model, [Record((named,), 'one kind')])
@@ -684,8 +655,7 @@ def test_where_no_labels_tell_kinds_the_voltage_does():
 
 
 def test_of_a_voltage_at_rest_parts_of_the_time_are_held_out():
-    model, record, _ = measured(None, 0.0, 1)
-    (piece,) = record.pieces
+    model, piece = plain()
     rest = replace(piece, v=np.full(piece.n, 5.0), segments=())
     rows = make_rows(model, [Record((rest,), 'one')])
     assert sum(label.startswith('one, part ') for label in rows.labels) > 3

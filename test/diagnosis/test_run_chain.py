@@ -24,6 +24,14 @@ def motion(n: int, start: float = 0.0) -> np.ndarray:
     return start + walk
 
 
+def behind_links(links: list, block: Block, rest: float) -> Block:
+    """Run a block through links that are at rest under a signal."""
+    for link in links:
+        rest = link.reset(0.0, rest)
+        block = link.process(block)
+    return block
+
+
 @pytest.mark.parametrize('delay', [Delay(1), Delay(3, 0.4)])
 def test_linear_links_pass_a_change_alone(delay):
     m, rate = 4, 20_000.0
@@ -42,10 +50,7 @@ def test_linear_links_pass_a_change_alone(delay):
     behind = Behind(links, [0.0] * 5, [block] * 5, m)
     assert not behind.bends
     found = behind.rows(change, 0.2)
-    rest, passed = 0.2, block.with_signal(change)
-    for link in links:
-        rest = link.reset(0.0, rest)
-        passed = link.process(passed)
+    passed = behind_links(links, block.with_signal(change), 0.2)
     np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
     assert np.ptp(found) > 0.1
 
@@ -59,8 +64,7 @@ def test_a_gain_that_follows_time_scales_a_change():
     links = [drift(rate, values), DelayOperator(Delay(8))]
     change = np.ones(x.size)
     found = Behind(links, [0.0] * 3, [block] * 3, m).rows(change, 1.0)
-    links[1].reset(0.0, links[0].reset(0.0, 1.0))
-    passed = links[1].process(links[0].process(block.with_signal(change)))
+    passed = behind_links(links, block.with_signal(change), 1.0)
     np.testing.assert_allclose(found, block_means(passed.x, m), rtol=0, atol=1e-12)
 
 
@@ -81,10 +85,7 @@ def test_a_curve_passes_a_change_as_two_runs_do():
     assert behind.bends
     found = behind.rows(change, 0.2)
     chain = [DynamicsOperator(PAPER), sensor(rate, values)]
-    moved, rest = block.with_signal(x + change), 0.6
-    for link in chain:
-        rest = link.reset(0.0, rest)
-        moved = link.process(moved)
+    moved = behind_links(chain, block.with_signal(x + change), 0.6)
     difference = block_means(moved.x - blocks[2].x, m)
     np.testing.assert_allclose(found, difference, rtol=0, atol=1e-12)
 
