@@ -119,23 +119,12 @@ def test_H_rises_with_lags_along_the_path_that_would_let_it_fall():
 
 
 def test_deviations_are_those_of_repeated_noise():
-    stage = truth()
-    fits = [
-        fit(stage, measured(stage, seed=0)),
-        *(
-            fit(
-                stage,
-                [
-                    replace(s, x=s.x + NOISE * np.random.default_rng(k).standard_normal(N))
-                    for s in measured(stage)
-                ],
-            )
-            for k in range(12)
-        ),
-    ]
-    at = LAW.size
-    a1 = [one.stage.dynamics.a[0] for one in fits[1:]]
-    std = np.sqrt(fits[1].covariance()[at, at])
+    stage, fits, at = truth(), [], LAW.size
+    for k in range(12):
+        noise = NOISE * np.random.default_rng(k).standard_normal(N)
+        fits.append(fit(stage, [replace(s, x=s.x + noise) for s in measured(stage)]))
+    a1 = [one.stage.dynamics.a[0] for one in fits]
+    std = np.sqrt(fits[0].covariance()[at, at])
     assert 0.4 < np.std(a1) / std < 1.6
 
 

@@ -73,14 +73,11 @@ def test_error_over_rows_is_weighted_by_samples():
     assert np.isnan(result.error('selection'))
 
 
-def test_headline_takes_both_errors_over_the_same_samples():
+def test_headline_takes_both_errors_over_the_same_samples_of_the_record_for_validation():
     headline = result_of(*ROWS).headline
     assert (headline.data, headline.records, headline.n) == ('held out', ('r',), 400)
     assert headline.percent == pytest.approx(np.sqrt((9 * 100 + 300) / 400))
     assert headline.static_percent == pytest.approx(2 * headline.percent)
-
-
-def test_headline_is_about_the_record_for_validation():
     further = ErrorRow('other', '', 4.0, 5.0, 0, 10, 'validation')
     headline = result_of(*ROWS, further).headline
     assert (headline.data, headline.records) == ('validation', ('other',))

@@ -105,15 +105,10 @@ def test_any_motion_tells_where_it_is_fast():
 
 
 @pytest.mark.filterwarnings('error')
-def test_silence_is_no_division_by_zero():
+def test_silence_is_no_division_by_zero_and_a_few_samples_will_do():
     zero, some = np.zeros(5000), np.random.default_rng(0).standard_normal(5000)
     for u, y in ((zero, zero), (zero, some), (some, zero)):
         est = frequency_response(u, y, FS)
         assert np.all(np.isfinite(est.coherence))
         assert np.all(np.isfinite(est.response))
-
-
-@pytest.mark.filterwarnings('error')
-def test_a_few_samples_will_do():
-    some = np.random.default_rng(0).standard_normal(20)
-    assert frequency_response(some, some, FS).frequency.size > 0
+    assert frequency_response(some[:20], some[:20], FS).frequency.size > 0

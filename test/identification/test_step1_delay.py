@@ -154,19 +154,13 @@ def test_the_smaller_delay_that_holds_is_kept(steps, scan, samples, source):
     assert (found.samples, found.source) == (samples, source)
 
 
-def test_a_delay_that_no_free_run_allows_is_replaced_by_a_smaller_one():
-    found = checked_delay(DelayResult(40, 9.0, 'steps'), *noise(6))
-    assert found.source == 'free run'
-    assert 1 <= found.samples <= 6
-    assert found.std > 1.0
-
-
-def test_noise_tells_a_delay_where_neither_steps_nor_the_loss_do():
-    found = checked_delay(DelayResult(30, np.inf, 'none'), *noise(6))
-    assert found.source == 'free run'
-    assert 1 <= found.samples <= 6
+def test_noise_tells_a_delay_where_no_free_run_allows_another_or_nothing_else_tells_one():
+    for given in (DelayResult(40, 9.0, 'steps'), DelayResult(30, np.inf, 'none')):
+        found = checked_delay(given, *noise(6))
+        assert found.source == 'free run' and 1 <= found.samples <= 6
+        assert given.source == 'none' or found.std > 1.0
     # where the delay is that long, nothing is claimed
-    assert checked_delay(DelayResult(30, np.inf, 'none'), *noise(33)).source == 'none'
+    assert checked_delay(given, *noise(33)).source == 'none'
 
 
 def test_a_delay_that_makes_no_difference_does_not_end_the_identification():

@@ -120,15 +120,15 @@ def test_a_line_with_noise_is_explained(linear):
     assert any('explains little of' in said for said in warnings_of(poor, [record], list(record)))
 
 
-def test_the_monitor_of_a_resting_axis_is_no_motion(linear):
+def test_axes_that_move_too_are_named_and_the_monitor_of_a_resting_one_is_not(linear):
     record, result = linear
     [piece] = record
     noise = 1e-2 * np.random.default_rng(1).standard_normal(piece.n)
-    for x, is_said in ((noise, False), (50.0 * noise, True)):
-        pieces = [replace(piece, channels={'v_b': x})]
-        assert (
-            any('v_b moved' in said for said in warnings_of(result, [record], pieces)) == is_said
-        )
+    others = {'v_c': np.full(piece.n, 2.0), 'y_b': piece.v, 'heat': piece.v}
+    for v_b, is_said in ((noise, False), (50.0 * noise, True), (piece.v[::-1], True)):
+        pieces = [replace(piece, channels={'v_b': v_b, **others})]
+        said = [x for x in warnings_of(result, [record], pieces) if 'axes' in x]
+        assert [x.startswith('v_b moved, too') for x in said] == [True] * is_said
 
 
 def test_a_record_of_many_sweeps_is_not_told_to_sweep_more(linear):

@@ -18,18 +18,17 @@ def one(name, error, size=3, effects=0):
 
 def test_the_least_error_wins_and_of_those_alike_the_smaller():
     assert best_of([one('a', 1.0), one('b', 0.5)]).name == 'b'
+    assert best_of([one('a', 1.0), one('b', 0.99)]).name == 'b'
     assert best_of([one('large', 1.0, 9), one('small', 0.99 * ALIKE, 2)]).name == 'small'
     assert best_of([one('large', 1.0, 9), one('small', 1.01 * ALIKE, 2)]).name == 'large'
+    # both ways of holding out count
+    assert Candidate('x', None, 4.0, 1.0).error == 2.0
 
 
 def test_an_effect_has_to_take_most_of_what_is_left():
     plain = one('plain', 1.0)
     assert best_of([plain, one('creep', 1.05 * EFFECT, 5, 1)]).name == 'plain'
     assert best_of([plain, one('creep', 0.9 * EFFECT / ALIKE, 5, 1)]).name == 'creep'
-
-
-def test_of_those_alike_and_as_small_the_better_wins():
-    assert best_of([one('a', 1.0), one('b', 0.99)]).name == 'b'
 
 
 def test_rounding_does_not_decide():
@@ -45,11 +44,6 @@ def test_an_effect_that_helps_too_little_to_be_taken_is_shown():
     assert shown_effect([plain, little], plain) is little
     assert shown_effect([plain, much], plain) is None
     assert shown_effect([plain], plain) is None
-
-
-def test_both_ways_of_holding_out_count():
-    both = Candidate('x', None, 4.0, 1.0)
-    assert both.error == 2.0
 
 
 def stretch(parts, rate=1000.0):

@@ -209,14 +209,8 @@ def test_predict_writes_the_band_or_asks_to_identify_again(capsys, tmp_path):
     PAPER.save(tmp_path / 'old.yaml')
     v = sine()
     write(Record.from_arrays(v, PAPER.simulate(v), sample_rate=FS), tmp_path / 'measured.npz')
-    np.savetxt(
-        tmp_path / 'scan.csv',
-        np.c_[np.arange(v.size) / FS, v],
-        '%.9g',
-        ',',
-        header='t,v',
-        comments='',
-    )
+    rows = np.c_[np.arange(v.size) / FS, v]
+    np.savetxt(tmp_path / 'scan.csv', rows, '%.9g', ',', header='t,v', comments='')
     for name in ('measured.npz', 'scan.csv'):
         out = tmp_path / f'{name}.out.npz'
         argv = ['predict', tmp_path / 'model.yaml', tmp_path / name, '--interval', '0.9']

@@ -38,6 +38,11 @@ def identified():
     return identify_and_judge(record, Settings(order=(10, 10), thresholds=10))
 
 
+@functools.cache
+def deviating():
+    return with_deviations(*identified())
+
+
 def test_replicates_of_a_mean_give_its_deviation():
     x = np.random.default_rng(1).standard_normal((40, 3))
     whole = x.mean(axis=0)
@@ -48,7 +53,7 @@ def test_replicates_of_a_mean_give_its_deviation():
 
 
 def test_the_deviations_are_about_as_large_as_the_errors():
-    result = with_deviations(*identified())
+    result = deviating()
     rows = result.model.quantities
     truth = quantities_of(STAGE.model, result)
     assert [p.name for p in truth] == [p.name for p in rows]
@@ -73,7 +78,7 @@ def test_the_triangle_moves_h_alone_and_the_noise_moves_both():
 
 def test_an_order_that_does_as_well_adds_its_difference():
     result, judged = identified()
-    quiet = with_deviations(result, judged).model.quantities
+    quiet = deviating().model.quantities
     G = result.model.dynamics
     other = Dynamics(G.a * 0.999 ** np.arange(1, G.a.size + 1), G.b).normalised()
     beside = replace(result.dynamics, others=(other, Dynamics.unit()))
@@ -98,7 +103,7 @@ def test_an_order_that_does_as_well_adds_its_difference():
 
 
 def test_deviations_are_in_the_parameters_the_file_the_json_and_the_summary():
-    result = with_deviations(*identified())
+    result = deviating()
     model = model_from_dict(model_to_dict(result.model))
     assert (
         model.quantities == result.model.quantities == result.parameters[-len(model.quantities) :]
@@ -127,15 +132,13 @@ def test_what_no_linear_fit_describes_keeps_the_deviations_of_its_steps():
     assert with_deviations(swarm, judged) is swarm
 
 
-@pytest.mark.parametrize('factor', [3.0])
-def test_more_noise_makes_larger_deviations(factor):
+def test_more_noise_makes_larger_deviations(factor=3.0):
     sensor = replace(STAGE.sensor, noise_rms=factor * 10 * STAGE.sensor.noise_rms)
     record = replace(STAGE, sensor=sensor).play(parse_program(PROGRAM))
     noisy = with_deviations(*identify_and_judge(record, Settings(order=(10, 10), thresholds=10)))
-    quiet = with_deviations(*identified())
     ratios = [
         a.std / b.std
-        for a, b in zip(noisy.model.quantities, quiet.model.quantities, strict=False)
+        for a, b in zip(noisy.model.quantities, deviating().model.quantities, strict=False)
         if a.name == b.name and np.isfinite(a.std)
     ]
     assert np.median(ratios) > factor

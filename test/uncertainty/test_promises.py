@@ -102,9 +102,18 @@ def swept(frequency):
     return Record.from_arrays(v, y + noise, sample_rate=2000.0)
 
 
-def test_what_a_fitted_start_explains_is_not_promised():
+QUICK = Settings(thresholds=6, order=(2, 2), delay=0)
+
+
+@functools.cache
+def of_sweep():
+    """Return a sweep and what is identified from it."""
     record = swept(lambda t: 1.0 + t)
-    result = identify(record, Settings(thresholds=6, order=(2, 2), delay=0))
+    return record, identify(record, QUICK)
+
+
+def test_what_a_fitted_start_explains_is_not_promised():
+    record, result = of_sweep()
     (piece,), use = record.pieces, np.ones(record.n, dtype=bool)
     # with the start of its own record the model errs by nothing
     run = JudgedRun(record.name, piece, piece.y, use, np.arange(record.n) > 3000)
@@ -113,19 +122,17 @@ def test_what_a_fitted_start_explains_is_not_promised():
 
 
 def test_a_known_zero_of_a_record_is_not_promised():
-    one, other = swept(lambda t: 1.0 + t), swept(lambda t: 2.0 + t)
-    settings = Settings(thresholds=6, order=(2, 2), delay=0)
-    together = identify([other, one], settings).promise.same
+    one, other = of_sweep()[0], swept(lambda t: 2.0 + t)
+    together = identify([other, one], QUICK).promise.same
     (p,) = other.pieces
     # a zero that does not show clearly beside the other errors
     moved = Record((replace(p, y=p.y + 0.02 * together * one.stroke),), 'moved')
-    assert 0.8 < identify([moved, one], settings).promise.same / together < 1.25
+    assert 0.8 < identify([moved, one], QUICK).promise.same / together < 1.25
 
 
 def test_one_frequency_promises_nothing_of_other_motion():
-    settings = Settings(thresholds=6, order=(2, 2), delay=0)
-    assert identify(swept(lambda t: 5.0), settings).promise.other is None
-    assert identify(swept(lambda t: 1.0 + t), settings).promise.other is not None
+    assert identify(swept(lambda t: 5.0), QUICK).promise.other is None
+    assert of_sweep()[1].promise.other is not None
 
 
 def test_a_measured_error_replaces_the_promise_of_a_diagnosis():

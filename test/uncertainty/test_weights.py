@@ -85,10 +85,7 @@ def test_a_kind_on_which_sets_err_alike_does_not_tell_them_apart():
     assert 0.5 < apart < agreed
 
 
-def test_errors_below_the_accuracy_of_a_law_are_alike():
+def test_errors_below_the_accuracy_of_a_law_are_alike_and_those_of_zero_have_weights():
     weights = weights_of(level(creep=0.1 * SMALLEST_EFFECT, backlash=0.2 * SMALLEST_EFFECT))
     assert weights['backlash'] > 0.4
-
-
-def test_errors_of_zero_have_weights():
     assert sum(weights_of(level(creep=0.0)).values()) == pytest.approx(1.0)
