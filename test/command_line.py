@@ -51,11 +51,3 @@ def csv_text(*left_out: str, **columns: object) -> str:
     c = {k: x for k, x in {**table(), **columns}.items() if k not in left_out}
     rows = [','.join(map(str, row)) for row in zip(*c.values(), strict=True)]
     return '\n'.join([','.join(c), *rows]) + '\n'
-
-
-def with_values(column: str, rows: range, value: object) -> str:
-    """Return it as CSV, with another value in some rows of a column."""
-    x = table()[column].tolist()
-    for i in rows:
-        x[i] = value
-    return csv_text(**{column: x})

@@ -168,17 +168,6 @@ def test_a_unit_converts(capsys, made, quick):
     refuse(capsys, made, argv, 'um.csv', '--displacement-unit')
 
 
-def test_misspelt_effects(capsys, made, quick):
-    argv = ['diagnose', made / 'model.yaml', made / 'val.npz']
-    refuse(capsys, made, [*argv, '--without', 'crep'], "'crep'; did you mean creep?")
-    refuse(capsys, made, [*argv, '--only', 'Thermal-Drift'], 'did you mean thermal_drift?')
-    refuse(capsys, made, [*argv, '--only', 'xyzzy'], 'see piezo_ident effects')
-    refuse(capsys, made, [*argv, *ONLY, '--without', 'creep'], 'leave no candidate')
-    everything = ','.join(catalogue())
-    refuse(capsys, made, [*argv, '--without', everything], 'leave no candidate')
-    assert quick == {}
-
-
 @pytest.mark.parametrize(
     ('options', 'word'),
     [
@@ -241,7 +230,7 @@ def test_interrupt_leaves_nothing(capsys, made, monkeypatch):
     assert sorted(made.rglob('*')) == before
 
 
-def test_catalogue(capsys):
+def test_catalogue(capsys, tmp_path):
     text = succeed(capsys, 'effects')
     data = json.loads(succeed(capsys, 'effects', '--json'))
     assert [e['name'] for e in data] == sorted(catalogue())
@@ -251,6 +240,7 @@ def test_catalogue(capsys):
         assert f'shows in: {effect["needs"]}\n' in text
     # one effect at length comes with another call
     assert len(text.splitlines()) < 4 * len(data)
+    refuse(capsys, tmp_path, ['effects', 'back_lash'], 'did you mean backlash?')
 
 
 @pytest.mark.parametrize('name', sorted(catalogue()))
@@ -267,10 +257,6 @@ def test_one_effect(capsys, name):
             assert f'{p.upper:g}' in row
             assert p.unit in row
     assert effect['documentation'].splitlines()[0] in text
-
-
-def test_a_misspelt_name(capsys, tmp_path):
-    refuse(capsys, tmp_path, ['effects', 'back_lash'], 'did you mean backlash?')
 
 
 def test_a_plug_in_is_listed_with_its_package(capsys, monkeypatch):

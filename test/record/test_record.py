@@ -64,23 +64,18 @@ def test_stroke_does_not_count_single_wild_samples():
     assert Record((Piece(V, Y, RATE),)).stroke == np.ptp(Y)
 
 
-def test_html_names_what_it_holds_and_escapes_it():
+def test_a_record_shows_what_it_holds():
     record = Record((Piece(V, Y, RATE),), '<b>')
     page = record._repr_html_()
     assert '&lt;b&gt;' in page
     assert '75' in page
     assert '75' in repr(record)
-
-
-def test_a_voltage_alone_has_no_stroke_to_show():
+    drawn = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 5.0))).plot()
+    assert [len(axes.lines) for axes in drawn.axes] == [2, 2]
+    # a voltage alone has no stroke
     shown = repr(Record((Piece(V, np.full(V.size, np.nan), RATE),)))
     assert '\u221e' not in shown
     assert 'none' in shown
-
-
-def test_plot_draws_voltage_and_displacement():
-    drawn = Record((Piece(V, Y, RATE), Piece(V, Y, RATE, 5.0))).plot()
-    assert [len(axes.lines) for axes in drawn.axes] == [2, 2]
 
 
 def test_what_needs_a_displacement_refuses_a_voltage_alone():

@@ -47,7 +47,7 @@ def is_mapped(x):
     return x is not None
 
 
-def test_a_long_bag_lies_in_memory_maps_and_reads_as_a_short_one(bag, monkeypatch):
+def test_a_long_bag_lies_in_memory_maps_and_is_read_and_predicted_as_a_short_one(bag, monkeypatch):
     long, short = spooled_and_not(bag, monkeypatch)
     assert all(is_mapped(p.v) and is_mapped(p.y) for p in long)
     assert not any(is_mapped(p.v) or is_mapped(p.y) for p in short)
@@ -57,13 +57,10 @@ def test_a_long_bag_lies_in_memory_maps_and_reads_as_a_short_one(bag, monkeypatc
         for x, x2 in ((one.v, other.v), (one.y, other.y)):
             np.testing.assert_array_equal(x, x2)
         np.testing.assert_array_equal(one.channels['heat'], other.channels['heat'])
-
-
-def test_a_long_record_is_predicted_as_a_short_one(bag, monkeypatch):
     model = SimulatedStage.load('paper').model
-    long, short = (free_run(model, r) for r in spooled_and_not(bag, monkeypatch))
-    assert long.errors == short.errors
-    assert long.errors_after_start == short.errors_after_start
+    one, other = (free_run(model, r) for r in (long, short))
+    assert one.errors == other.errors
+    assert one.errors_after_start == other.errors_after_start
 
 
 def test_no_room_for_a_long_record_is_a_line(bag, monkeypatch, tmp_path):

@@ -74,12 +74,8 @@ def test_the_help_of_a_unit_tells_of_volts_where_a_column_may_hold_them(capsys):
     assert 'volt' not in of_unit[0]
 
 
-def test_columns_may_be_given_in_parts():
-    given = parsed('identify r.csv --columns t=a --columns v=b')
-    assert given['columns'] == 't=a,v=b'
-
-
-def test_validation_takes_all_words_up_to_the_next_option():
+def test_columns_may_be_given_in_parts_and_validation_takes_all_words_up_to_the_next_option():
+    assert parsed('identify r.csv --columns t=a --columns v=b')['columns'] == 't=a,v=b'
     given = parsed('identify a b --validation c d --model m.yaml --validation e')
     assert list(map(str, given['records'])) == ['a', 'b']
     assert list(map(str, given['validation'])) == ['c', 'd', 'e']

@@ -305,16 +305,8 @@ def test_remapped_and_further_topics(tmp_path):
     got = read_bag(write(tmp_path / 'bag', messages))
     assert got.n == 1000
     assert list(got.pieces[0].channels) == ['temp']
-    messages = [
-        m
-        for v, y in blocks()
-        for m in (
-            ('/applied_voltage', v),
-            ('/voltage', v),
-            ('/displacement', y),
-            ('/prediction', y),
-        )
-    ]
+    names = ('/applied_voltage', '/voltage', '/displacement', '/prediction')
+    messages = [m for v, y in blocks() for m in zip(names, (v, v, y, y), strict=True)]
     assert read_bag(write(tmp_path / 'bag2', messages)).n == 1000
 
 
@@ -413,19 +405,16 @@ def test_bag_without_samples(tmp_path):
         read_bag(path)
 
 
-def test_folder_without_a_bag(tmp_path):
+@pytest.mark.parametrize('text', [None, '', '{', 'a: 1', 'rosbag2_bagfile_information: 3'])
+def test_damaged_metadata_and_a_folder_without_a_bag(tmp_path, text):
     write_bag(record(), tmp_path / 'bag')
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    (tmp_path / 'bag' / 'bag.mcap').unlink()
-    with pytest.raises(DataError, match='ros2 bag reindex'):
-        read_bag(tmp_path / 'bag')
-
-
-@pytest.mark.parametrize('text', ['', '{', 'a: 1', 'rosbag2_bagfile_information: 3'])
-def test_damaged_metadata(tmp_path, text):
-    write_bag(record(), tmp_path / 'bag')
-    (tmp_path / 'bag' / 'metadata.yaml').write_text(text)
-    with pytest.raises(DataError, match='damaged or unfinished bag'):
+    if text is None:
+        for name in ('metadata.yaml', 'bag.mcap'):
+            (tmp_path / 'bag' / name).unlink()
+    else:
+        (tmp_path / 'bag' / 'metadata.yaml').write_text(text)
+    says = 'ros2 bag reindex' if text is None else 'damaged or unfinished bag'
+    with pytest.raises(DataError, match=says):
         read_bag(tmp_path / 'bag')
 
 

@@ -63,8 +63,29 @@ def tabs(*columns) -> str:
     return rows(*columns, separator='\t', comma=True)
 
 
+def table(folder: Path, header: str, *columns, name: str = 'r.csv') -> Path:
+    """Write columns below a header, which may be of several lines."""
+    path = folder / name
+    path.write_text(f'{header}\n{rows(*columns)}')
+    return path
+
+
+def write_tdms(path: Path, *channels) -> Path:
+    """Write channels of a group, a name, samples and properties."""
+    tdms = pytest.importorskip('nptdms')
+    with tdms.TdmsWriter(path) as writer:
+        for group, name, x, properties in channels:
+            writer.write_segment([tdms.ChannelObject(group, name, x, properties)])
+    return path
+
+
+def assert_is_the_motion(piece, v=V) -> None:
+    assert piece.sample_rate == RATE
+    np.testing.assert_array_equal(piece.v, v)
+    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+
+
 def over_midnight(seconds: float) -> str:
-    """Return a time of the day."""
     hour = '23:59' if seconds < 60 else '00:00'
     return f'{hour}:{seconds % 60:07.4f}'
 
@@ -138,11 +159,9 @@ def daq_h5(path: Path) -> None:
 
 
 def daq_tdms(path: Path) -> None:
-    tdms = pytest.importorskip('nptdms')
-    with tdms.TdmsWriter(path) as writer:
-        for name, unit, x in (('Command', 'Volts', V), ('Strain gauge', 'um', UM)):
-            wave = {'wf_increment': 1 / RATE, 'wf_start_offset': 0.0, 'unit_string': unit}
-            writer.write_segment([tdms.ChannelObject('Log', name, x, wave)])
+    wave = {'wf_increment': 1 / RATE, 'wf_start_offset': 0.0}
+    drive = ('Log', 'Command', V, {**wave, 'unit_string': 'Volts'})
+    write_tdms(path, drive, ('Log', 'Strain gauge', UM, {**wave, 'unit_string': 'um'}))
 
 
 def daq_parquet(path: Path) -> None:
@@ -194,10 +213,7 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, name):
 @pytest.mark.parametrize(
     ('header', 'words'),
     [
-        (
-            'time,out,volt_a,volt_b',
-            ['2 columns may be the voltage', '--columns v=volt_a', 'volt_b'],
-        ),
+        ('time,out,volt_a,volt_b', ['may be the voltage', '--columns v=volt_a', 'volt_b']),
         ('time,U,U,pos', ['2 columns may be the voltage (U, U)', '--columns v=2 or', 'v=3']),
         ('t,v_x,v_y,y_x,y_y', ['--columns y=y_x or --columns y=y_y; for two axes', 'v_b and y_b']),
         ('t,drive_1,drive_2,pos_1,pos_2', ['v=drive_2; for two axes name all columns']),
@@ -216,9 +232,8 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, name):
     ],
 )
 def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
-    path = tmp_path / 'r.csv'
     columns = (K / RATE, V, 1e-6 * UM, V, V)[: header.count(',') + 1]
-    path.write_text(f'{header}\n{rows(*columns)}')
+    path = table(tmp_path, header, *columns)
     with pytest.raises(DataError) as caught:
         pi.read(path)
     message = str(caught.value)
@@ -241,8 +256,7 @@ def test_what_a_header_does_not_say_is_asked_for(tmp_path, header, words):
     ],
 )
 def test_options_that_do_not_fit_the_file(tmp_path, choices, words):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'a,b,c\n{rows(K / RATE, V, 2 * UM)}')
+    path = table(tmp_path, 'a,b,c', K / RATE, V, 2 * UM)
     with pytest.raises(DataError) as caught:
         pi.read(path, **choices)
     assert all(word in str(caught.value) for word in words), str(caught.value)
@@ -269,8 +283,7 @@ def test_segments_and_channels_of_other_names(tmp_path):
 
 
 def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text(f't,v,y\n{rows(K / 5, 1e3 * V, 1e-4 * UM)}')
+    path = table(tmp_path, 't,v,y', K / 5, 1e3 * V, 1e-4 * UM)
     doubts = {f.name: f.action for f in pi.read(path).faults}
     assert doubts.keys() == {'slow_sampling', 'large_stroke', 'high_voltage'}
     assert '--time-unit ms' in doubts['slow_sampling']
@@ -281,8 +294,7 @@ def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
 
 
 def test_volts_of_a_sensor_and_of_a_monitor(tmp_path, capsys):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'Zeit (ms),Monitor (mV),Sensor (V)\n{rows(1e3 * K / RATE, 50 * V, UM / 10)}')
+    path = table(tmp_path, 'Zeit (ms),Monitor (mV),Sensor (V)', 1e3 * K / RATE, 50 * V, UM / 10)
     with pytest.raises(DataError, match='what one V is, as in --displacement-unit 10um'):
         pi.read(path, columns='y=Sensor (V)')
     given = ['--columns', 'y=Sensor (V)', '--displacement-unit', '10um', '--voltage-unit', '20mV']
@@ -305,8 +317,7 @@ def test_volts_of_a_sensor_and_of_a_monitor(tmp_path, capsys):
     ],
 )
 def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, cure):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'{header},voltage,position_um\n{rows(K / rate, V, UM)}')
+    path = table(tmp_path, f'{header},voltage,position_um', K / rate, V, UM)
     doubts = {f.name: f.action for f in pi.read(path).faults}
     assert cure in doubts[f'{kind}_sampling']
     assert main(['convert', str(path), str(tmp_path / 'o.npz')]) == 0
@@ -316,24 +327,23 @@ def test_a_rate_that_no_stage_has_is_said(tmp_path, capsys, header, rate, kind, 
 
 
 @pytest.mark.parametrize(
-    ('header', 'options', 'kind', 'cure'),
+    ('header', 'rate', 'kind', 'cure'),
     [
-        ('voltage,position_um', '--rate 5', 'slow_sampling', '--rate 20e3'),
-        ('voltage,position_um', '--rate 5e6', 'fast_sampling', '--rate 20e3'),
-        ('voltage_mV,position_um', '--rate 5e3', 'large_gain', '--voltage-unit'),
+        ('voltage,position_um', 5.0, 'slow_sampling', '--rate 20e3'),
+        ('voltage,position_um', 5e6, 'fast_sampling', '--rate 20e3'),
+        ('voltage_mV,position_um', 5e3, 'large_gain', '--voltage-unit'),
+        ('Sample interval: 0.2\nCH1 (V),CH2 (um)', None, 'slow_sampling', '--rate 5000'),
     ],
 )
-def test_a_slip_of_a_thousand_is_said(tmp_path, capsys, header, options, kind, cure):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'{header}\n{rows(V, UM)}')
-    assert main(['convert', str(path), str(tmp_path / 'o.npz'), *options.split()]) == 0
+def test_a_slip_of_a_thousand_is_said(tmp_path, capsys, header, rate, kind, cure):
+    path, options = table(tmp_path, header, V, UM), ['--rate', str(rate)] if rate else []
+    assert main(['convert', str(path), str(tmp_path / 'o.npz'), *options]) == 0
     assert cure in capsys.readouterr().err
-    assert kind in {f.name for f in pi.read(path, rate=float(options.split()[1])).faults}
+    assert cure in {f.name: f.action for f in pi.read(path, rate=rate).faults}[kind]
 
 
 def test_time_that_is_rounded_is_not_guessed_where_two_rates_fit(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text('t,v,y\n' + rows(np.round(K / 4967.3, 3), V, 1e-6 * UM))
+    path = table(tmp_path, 't,v,y', np.round(K / 4967.3, 3), V, 1e-6 * UM)
     with pytest.raises(DataError, match=r'two different samples.*--rate 496\d'):
         pi.read(path)
     assert pi.read(path, rate=4967.3).pieces[0].sample_rate == 4967.3
@@ -351,16 +361,13 @@ def test_a_missing_library_is_named(tmp_path, monkeypatch):
 
 
 def test_a_tdms_file_may_hold_channels_of_other_rates(tmp_path):
-    tdms = pytest.importorskip('nptdms')
-
     def written(name, period_of_y, *slow):
-        path = tmp_path / name
         every = [('Command', V, 1 / RATE), ('Position', UM * 1e-6, period_of_y), *slow]
-        with tdms.TdmsWriter(path) as writer:
-            for i, (title, x, period) in enumerate(every):
-                wave = {'wf_increment': period} if period else {}
-                writer.write_segment([tdms.ChannelObject(f'G{i}', title, x, wave)])
-        return path
+        channels = [
+            (f'G{i}', title, x, {'wf_increment': period})
+            for i, (title, x, period) in enumerate(every)
+        ]
+        return write_tdms(tmp_path / name, *channels)
 
     slow = ('Temperature', V[:20], 100 / RATE)
     for name, order in (('last.tdms', [slow]), ('alone.tdms', [])):
@@ -395,29 +402,43 @@ def test_signals_with_a_name_beside_their_samples(tmp_path):
     simulink = struct(time=K[:, None] / RATE, signals=np.hstack(labelled))
     scipy.io.savemat(tmp_path / 's.mat', {'out': simulink})
     for name in ('d.mat', 's.mat'):
-        (piece,) = pi.read(tmp_path / name).pieces
-        assert piece.sample_rate == RATE
-        np.testing.assert_array_equal(piece.v, V)
-        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+        assert_is_the_motion(pi.read(tmp_path / name).pieces[0])
     # two of one name keep their numbers
     other = pi.read(tmp_path / 'd.mat', columns='v=e1.Y.4.Data')
     np.testing.assert_array_equal(other.pieces[0].v, V)
 
 
-def test_an_oscilloscope_whose_channels_are_called_by_numbers(tmp_path, capsys):
-    path, out = tmp_path / 'scope.csv', str(tmp_path / 'o.npz')
-    table = rows(K / RATE, V, K / RATE, UM / 10)
-    path.write_text(f'x-axis,1,x-axis,2\nsecond,Volt,second,Volt\n{table}')
+@pytest.mark.parametrize(
+    ('head', 'columns', 'asks'),
+    [
+        (
+            'x-axis,1,x-axis,2\nsecond,Volt,second,Volt',
+            (K / RATE, V, K / RATE, UM / 10),
+            ('--columns t=1 or', "--columns 'v=1 [Volt]' or", "--columns 'y=2 [Volt]'"),
+        ),
+        (
+            'X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.0e-01,2.0e-04',
+            (K, V, UM / 10, np.full(N, '')),
+            ("--columns 'v=CH1 [Volt]'", "--columns 'y=CH2 [Volt]'"),
+        ),
+    ],
+    ids=['channels called by numbers', 'increment in the header'],
+)
+def test_an_oscilloscope_asks_for_one_column_after_the_other(
+    tmp_path, capsys, head, columns, asks
+):
+    path, out = table(tmp_path, head, *columns), str(tmp_path / 'o.npz')
     given = []
-    for said in ('--columns t=1 or', "--columns 'v=1 [Volt]' or", "--columns 'y=2 [Volt]'"):
+    for said in asks:
+        # each line asks for what is missing, as it is typed
         assert main(['convert', str(path), out, *given]) == 2
         assert said in capsys.readouterr().err
         given += shlex.split(said.removesuffix(' or'))
-    assert main(['convert', str(path), out, *given, '--displacement-unit', '10um']) == 0
-    by_number = pi.read(path, columns='t=1,v=2,y=4', displacement_unit='10um').pieces[0]
-    for piece in (by_number, pi.read(out).pieces[0]):
-        np.testing.assert_array_equal(piece.v, V)
-        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+    assert main(['convert', str(path), out, *given, '--displacement-unit', '10um/V']) == 0
+    assert_is_the_motion(pi.read(out).pieces[0])
+    if head.startswith('x-axis'):
+        by_number = pi.read(path, columns='t=1,v=2,y=4', displacement_unit='10um')
+        assert_is_the_motion(by_number.pieces[0])
 
 
 @pytest.mark.parametrize('suffix', ['txt', 'lvm', 'h5', 'tdms', 'parquet'])
@@ -433,18 +454,6 @@ def test_damaged_files(tmp_path, suffix):
 # --- units of headers and options -----------------------------------------------------------
 
 
-def scope_csv_of(path: Path, names: dict) -> None:
-    path.write_text(','.join(names) + '\n' + rows(*names.values()))
-
-
-def scope_npz(path: Path, names: dict) -> None:
-    np.savez(path, **names)
-
-
-def scope_mat(path: Path, names: dict) -> None:
-    scipy.io.savemat(path, {'run': names})
-
-
 def scope_h5(path: Path, names: dict) -> None:
     h5py = pytest.importorskip('h5py')
     with h5py.File(path, 'w') as file:
@@ -455,26 +464,28 @@ def scope_h5(path: Path, names: dict) -> None:
 
 
 def scope_tdms(path: Path, names: dict) -> None:
-    tdms = pytest.importorskip('nptdms')
-    with tdms.TdmsWriter(path) as writer:
-        for name, x in names.items():
-            base, unit = name.split('_')
-            writer.write_segment([tdms.ChannelObject('run', base, x, {'unit_string': unit})])
+    split = [(*name.split('_'), x) for name, x in names.items()]
+    write_tdms(path, *(('run', base, x, {'unit_string': unit}) for base, unit, x in split))
 
 
-SCOPE = {'csv': scope_csv_of, 'npz': scope_npz, 'mat': scope_mat, 'h5': scope_h5}
-SCOPE['tdms'] = scope_tdms
+#: what writes columns by name, and the name of the displacement
+SCOPE = {
+    'csv': (lambda path, c: table(path.parent, ','.join(c), *c.values(), name=path.name), 'B_mV'),
+    'npz': (lambda path, c: np.savez(path, **c), 'B_mV'),
+    'mat': (lambda path, c: scipy.io.savemat(path, {'run': c}), 'run.B_mV'),
+    'h5': (scope_h5, 'run/B'),
+    'tdms': (scope_tdms, 'run/B'),
+}
 
 
 @pytest.mark.parametrize('suffix', SCOPE)
 def test_units_are_judged_the_same_way_in_every_format(tmp_path, suffix):
     k = np.arange(300)
     v = 5.0 - 5.0 * np.cos(0.1 * k)
-    path = tmp_path / f'scope.{suffix}'
+    path, (write, y) = tmp_path / f'scope.{suffix}', SCOPE[suffix]
     # a sensor of 0.1 V at full stroke, in mV, and a voltage in kV
-    SCOPE[suffix](path, {'time_ms': 1.0 * k, 'drive_kV': 1e-3 * v, 'B_mV': 10.0 * v})
-    number = {'csv': 'B_mV', 'npz': 'B_mV', 'mat': 'run.B_mV', 'h5': 'run/B', 'tdms': 'run/B'}
-    columns = {'y': number[suffix]}
+    write(path, {'time_ms': 1.0 * k, 'drive_kV': 1e-3 * v, 'B_mV': 10.0 * v})
+    columns = {'y': y}
     (piece,) = pi.read(path, columns=columns, displacement_unit='10um/V').pieces
     assert piece.sample_rate == 1000.0
     np.testing.assert_allclose(piece.v, v, rtol=1e-9)
@@ -502,8 +513,7 @@ def test_units_are_judged_the_same_way_in_every_format(tmp_path, suffix):
     ],
 )
 def test_units_of_header_and_option(tmp_path, header, choices, v_by, y_by):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'{header}\n{rows(K / RATE, V, UM)}')
+    path = table(tmp_path, header, K / RATE, V, UM)
     (piece,) = pi.read(path, columns='v=2,y=3', **choices).pieces
     np.testing.assert_allclose(piece.v, v_by * V, rtol=1e-12)
     np.testing.assert_allclose(piece.y, y_by * UM, rtol=1e-12)
@@ -522,8 +532,7 @@ def test_units_of_header_and_option(tmp_path, header, choices, v_by, y_by):
 def test_a_unit_that_the_header_contradicts_is_asked_about(
     tmp_path, capsys, header, choices, words
 ):
-    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
-    path.write_text(f'{header}\n{rows(K / RATE, V, UM)}')
+    path, out = table(tmp_path, header, K / RATE, V, UM), str(tmp_path / 'o.npz')
     argv = ['convert', str(path), out, '--columns', 'v=2,y=3']
     assert main([*argv, *choices.split()]) == 2
     said = capsys.readouterr().err
@@ -534,8 +543,7 @@ def test_a_unit_that_the_header_contradicts_is_asked_about(
 
 
 def test_an_axis_keeps_the_unit_of_its_own_header(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text(f't,v [mV],y,v_b,y_b [nm]\n{rows(K / RATE, V, UM, V, UM)}')
+    path = table(tmp_path, 't,v [mV],y,v_b,y_b [nm]', K / RATE, V, UM, V, UM)
     (piece,) = pi.read(path, displacement_unit='um', voltage_unit='20V').pieces
     np.testing.assert_allclose(piece.channels['v_b'], piece.v, rtol=1e-12)
     np.testing.assert_allclose(1e3 * piece.channels['y_b'], piece.y, rtol=1e-12)
@@ -544,9 +552,11 @@ def test_an_axis_keeps_the_unit_of_its_own_header(tmp_path):
 def test_what_the_units_make_of_the_numbers_is_printed(tmp_path, capsys):
     names = 'Time,Channel A,Channel B\n(ms),(V),(mV)\n\n'
     v = 5.0 - 5.0 * np.cos(0.1 * np.arange(300))
-    paths = [tmp_path / name for name in ('a.csv', 'b.csv')]
-    for i, path in enumerate(paths, 1):
-        path.write_text(names + rows(np.arange(300.0), v, 100.0 * i * v))
+    n = np.arange(300.0)
+    paths = [
+        table(tmp_path, names, n, v, 100.0 * i * v, name=name)
+        for i, name in enumerate(('a.csv', 'b.csv'), 1)
+    ]
     given = ['--columns', 'v=2,y=3', '--displacement-unit', '1um/V']
     assert main(['convert', *given, str(paths[0]), str(tmp_path / 'o.npz')]) == 0
     printed = capsys.readouterr()
@@ -561,8 +571,8 @@ def test_what_the_units_make_of_the_numbers_is_printed(tmp_path, capsys):
 
 
 def test_a_stroke_that_is_none_brings_a_unit_that_is_taken(tmp_path, capsys):
-    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
-    path.write_text(f't [s],drive [V],pos [mm]\n{rows(K / RATE, V, UM)}')
+    path = table(tmp_path, 't [s],drive [V],pos [mm]', K / RATE, V, UM)
+    out = str(tmp_path / 'o.npz')
     assert main(['convert', str(path), out]) == 2
     shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
     assert main(shlex.split(shown)) == 0
@@ -596,8 +606,7 @@ def test_columns_by_the_path_in_an_hdf5_file(tmp_path, columns):
         file['run1/both'].attrs['unit'] = 'um'
         file['run1/ai0'].attrs['unit'] = 'um'
     (piece,) = pi.read(tmp_path / 'r.h5', columns=columns, rate=RATE).pieces
-    np.testing.assert_array_equal(piece.v, V + ('2' in columns['v']))
-    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+    assert_is_the_motion(piece, V + ('2' in columns['v']))
 
 
 @pytest.mark.parametrize(
@@ -610,21 +619,19 @@ def test_columns_by_the_path_in_an_hdf5_file(tmp_path, columns):
     ],
 )
 def test_columns_by_group_and_channel_of_a_tdms_file(tmp_path, columns):
-    tdms = pytest.importorskip('nptdms')
-    channels = [('Log', 'out', V, 'V'), ('Log', 'Strain gauge', UM, 'um'), ('B', 'out', -V, 'V')]
-    # its words are those of another path
-    channels += [('Log Strain', 'gauge', UM, 'um')] * (columns['y'] == 'Log Strain/gauge')
-    with tdms.TdmsWriter(tmp_path / 'r.tdms') as writer:
-        for group, name, x, unit in channels:
-            wave = {'wf_increment': 1 / RATE, 'unit_string': unit}
-            writer.write_segment([tdms.ChannelObject(group, name, x, wave)])
-    if len(channels) > 3:
+    wave = {'wf_increment': 1 / RATE}
+    channels = [('Log', 'out', V, {**wave, 'unit_string': 'V'})]
+    channels += [('B', 'out', -V, wave)]
+    # in the last case the words are those of another path
+    is_another = columns['y'] == 'Log Strain/gauge'
+    for group, name in [('Log', 'Strain gauge'), ('Log Strain', 'gauge')][: 1 + is_another]:
+        channels.append((group, name, UM, {**wave, 'unit_string': 'um'}))
+    path = write_tdms(tmp_path / 'r.tdms', *channels)
+    if is_another:
         with pytest.raises(DataError, match=r'no column .Log Strain/gauge'):
-            pi.read(tmp_path / 'r.tdms', columns=columns)
+            pi.read(path, columns=columns)
         return
-    (piece,) = pi.read(tmp_path / 'r.tdms', columns=columns).pieces
-    np.testing.assert_array_equal(piece.v, V)
-    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+    assert_is_the_motion(pi.read(path, columns=columns).pieces[0])
 
 
 def test_columns_by_the_fields_of_matlab_structs(tmp_path):
@@ -637,29 +644,10 @@ def test_columns_by_the_fields_of_matlab_structs(tmp_path):
         {'v': 'out.signals(2).values', 'y': 'out.signals(1).values'},
         {'v': 'run.m(:,2)', 'y': 'run/ai0_um'},
     ):
-        (piece,) = pi.read(tmp_path / 's.mat', columns=columns, rate=RATE).pieces
-        np.testing.assert_array_equal(piece.v, V)
-        np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
+        assert_is_the_motion(pi.read(tmp_path / 's.mat', columns=columns, rate=RATE).pieces[0])
 
 
 # --- the sampling rate in a header ----------------------------------------------------------
-
-
-def test_an_oscilloscope_with_the_increment_in_its_header(tmp_path, capsys):
-    path, out = tmp_path / 'rigol.csv', str(tmp_path / 'o.npz')
-    table = rows(K, V, UM / 10).replace('\n', ',\n')
-    path.write_text(f'X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.0e-01,2.0e-04\n{table}')
-    given = []
-    for said in ("--columns 'v=CH1 [Volt]'", "--columns 'y=CH2 [Volt]'"):
-        # each line asks for what is missing, as it is typed
-        assert main(['convert', str(path), out, *given]) == 2
-        assert said in capsys.readouterr().err
-        given += shlex.split(said)
-    assert main(['convert', str(path), out, *given, '--displacement-unit', '10um/V']) == 0
-    (piece,) = pi.read(out).pieces
-    assert piece.sample_rate == RATE
-    np.testing.assert_array_equal(piece.v, V)
-    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -678,16 +666,7 @@ def test_a_sample_time_above_the_table(tmp_path, head, end):
     path = tmp_path / 'r.csv'
     path.write_text(f'{head}\n' + rows(V, UM).replace('\n', f'{end}\n'))
     options = {} if any(x in head for x in '=:') or '\n' in head else {'rate': RATE}
-    (piece,) = pi.read(path, **options).pieces
-    assert piece.sample_rate == RATE
-    np.testing.assert_array_equal(piece.v, V)
-    np.testing.assert_allclose(piece.y, 1e-6 * UM, rtol=1e-12)
-
-
-def test_a_trailing_comma_in_the_rows_alone(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text('t,v,y\n' + rows(K / RATE, V, 1e-6 * UM).replace('\n', ',\n'))
-    np.testing.assert_array_equal(pi.read(path).pieces[0].v, V)
+    assert_is_the_motion(pi.read(path, **options).pieces[0])
 
 
 @pytest.mark.parametrize(
@@ -699,17 +678,9 @@ def test_a_trailing_comma_in_the_rows_alone(tmp_path):
     ],
 )
 def test_a_rate_that_is_suggested_is_the_one_in_the_file(tmp_path, capsys, head):
-    path, out = tmp_path / 'r.csv', str(tmp_path / 'o.npz')
     columns = (V, UM) if 'Time' not in head else (np.array(['now'] * N), V, UM)
-    path.write_text(f'{head}\n{rows(*columns)}')
+    path, out = table(tmp_path, head, *columns), str(tmp_path / 'o.npz')
     assert main(['convert', str(path), out]) == 2
     shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
     assert main([*shlex.split(shown), '--displacement-unit', 'um']) == 0
     assert pi.read(out).pieces[0].sample_rate == RATE
-
-
-def test_a_slip_in_the_unit_of_a_sample_time_is_said(tmp_path):
-    path = tmp_path / 'r.csv'
-    path.write_text(f'Sample interval: 0.2\nCH1 (V),CH2 (um)\n{rows(V, UM)}')
-    (fault,) = (f for f in pi.read(path).faults if f.name == 'slow_sampling')
-    assert fault.action.endswith('--rate 5000')
