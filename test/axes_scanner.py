@@ -35,7 +35,6 @@ def path(model, source, share):
 
 
 def scanner():
-    """Return the stage."""
     first, second = chain([0.1, 0.1, 0.1], 0.5, 50e-6), chain([0.15, 0.1, 0.05], 0.6, 40e-6)
     return pi.MultiAxisModel(
         {'y': path(first, 'motion_b', CROSS[1]), 'y_b': path(second, 'motion', CROSS[0])}

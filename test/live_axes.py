@@ -91,7 +91,6 @@ def simulated(model, v, axes=AXES):
 
 
 def blocks(v, rate, size=70, start=0):
-    """Cut voltages into blocks."""
     t = (start + np.arange(v.shape[1])) / rate
     ends = range(0, t.size, size)
     return [Samples(t[k : k + size], np.ascontiguousarray(v[:, k : k + size])) for k in ends]

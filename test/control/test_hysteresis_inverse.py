@@ -54,6 +54,9 @@ def test_limits_of_voltage_and_speed_are_kept_and_the_goal_is_met_again(seed):
 def test_an_h_that_falls_is_refused():
     with pytest.raises(ModelError, match=r'no inverse: its slope falls to -0\.4'):
         HysteresisInverse(Hysteresis([0.1], [0.1], -0.8, 2.0))
+    # no line stands for a wide play
+    with pytest.raises(ModelError, match=r'falls to -0\.05 at 0 V'):
+        HysteresisInverse(Hysteresis([0.1, 0.4], [0.5, 0.2], 0.0, -0.05))
 
 
 def test_it_starts_anywhere():
@@ -81,8 +84,3 @@ def test_an_h_that_falls_within_narrow_plays_is_inverted_without_jumps(seed, law
     error = h(np.append(0.5, u))[1:] - np.append(goal, ripple)
     lines = inverse.hysteresis.thresholds != h.thresholds
     assert np.ptp(error) < 1.5 * float(h.weights[lines] @ h.thresholds[lines])
-
-
-def test_no_line_stands_for_a_wide_play():
-    with pytest.raises(ModelError, match=r'falls to -0\.05 at 0 V'):
-        HysteresisInverse(Hysteresis([0.1, 0.4], [0.5, 0.2], 0.0, -0.05))

@@ -85,14 +85,10 @@ def test_silence_ends_at_rest_exactly(level):
 
 
 def test_a_ramp_that_must_end_in_time_is_steeper_but_keeps_the_slew():
-    guard = Guard(USUAL, applied=10.0)
-    v = guard.idle(200, longest=0.1)
-    within(v, 10.0)
-    assert np.flatnonzero(v == 0.0)[0] == 99
-    guard = Guard(USUAL, applied=10.0)
-    v = guard.idle(200, longest=0.001)
-    within(v, 10.0)
-    assert np.flatnonzero(v == 0.0)[0] == 19
+    for longest, end in ((0.1, 99), (0.001, 19)):
+        v = Guard(USUAL, applied=10.0).idle(200, longest=longest)
+        within(v, 10.0)
+        assert np.flatnonzero(v == 0.0)[0] == end
 
 
 @pytest.mark.parametrize(

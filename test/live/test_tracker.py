@@ -4,6 +4,7 @@
 """From a reference to a voltage: joined softly, safe, and glitch-free from model to model."""
 
 from dataclasses import replace
+import functools
 
 from effect_table import VISIBLE
 from hypothesis import given, settings
@@ -134,6 +135,7 @@ SLOW = EffectSetting('creep', {'gain': [0.02, 0.01], 'time_constant': [0.1, 5.0]
 CREEPS = replace(PAPER, effects=(SLOW,), identification={'errors': {'held_out': 0.02}})
 
 
+@functools.cache
 def run_of(follow, gain=1.0, zero=0.0, earlier=False, seconds=1.5, readings=lambda y: y, size=100):
     """Return tracker, voltage and error in % of the scan's span, of a stage that answers."""
     tracker, stage = Tracker(CREEPS, SETTINGS, 400, follow=follow), CREEPS.stream()
