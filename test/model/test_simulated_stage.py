@@ -188,9 +188,11 @@ def test_converter_takes_the_nearest_code(bits, low, span, x):
     assert c.outside(value) == np.sum((value < low) | (value > c.high))
 
 
-def test_wrong_rate_is_refused():
+def test_a_wrong_rate_and_a_missing_file_are_refused():
     with pytest.raises(ModelError, match='sampled at 1000 Hz'):
         PAPER.play(sequence('{signal: idle, duration: 1}', 1000), np.random.default_rng(0))
+    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such stage'):
+        SimulatedStage.load('nowhere.yaml')
 
 
 def test_plain_model_file_is_an_ideal_stage():
@@ -224,8 +226,3 @@ def test_a_wrong_configuration_is_refused(change, says):
         stage_from_dict(data, 'lab.yaml')
     assert str(caught.value).startswith('lab.yaml')
     assert '\n' not in str(caught.value)
-
-
-def test_missing_file_is_named():
-    with pytest.raises(ConfigError, match=r'nowhere\.yaml: no such stage'):
-        SimulatedStage.load('nowhere.yaml')

@@ -25,8 +25,6 @@ class Add:
 
 
 class Double(Add):
-    """Multiply by two."""
-
     def reset(self, v0, x0):
         return 2 * x0
 

@@ -197,16 +197,13 @@ def test_no_static_gain_cannot_be_normalised(a, b):
 
 
 @pytest.mark.parametrize(
-    ('a', 'b'), [([np.nan], [1]), ([0.1], [np.inf]), ([0.1], []), ([[0.1]], [1.0]), (0.1, [1.0])]
+    ('kind', 'numbers'),
+    [
+        *((Dynamics, x) for x in (([np.nan], [1]), ([0.1], [np.inf]), ([0.1], []))),
+        *((Dynamics, x) for x in (([[0.1]], [1.0]), (0.1, [1.0]))),
+        *((Delay, x) for x in ((-1, 0), (1.5, 0), (np.nan, 0), (np.inf, 0), (1, 1.0), (1, -0.1))),
+    ],
 )
-def test_what_is_no_filter_is_refused(a, b):
+def test_what_is_neither_filter_nor_delay_is_refused(kind, numbers):
     with pytest.raises(ModelError):
-        Dynamics(a, b)
-
-
-@pytest.mark.parametrize(
-    ('samples', 'fraction'), [(-1, 0), (1.5, 0), (np.nan, 0), (np.inf, 0), (1, 1.0), (1, -0.1)]
-)
-def test_what_is_no_delay_is_refused(samples, fraction):
-    with pytest.raises(ModelError):
-        Delay(samples, fraction)
+        kind(*numbers)

@@ -10,7 +10,7 @@ import piezo_ident as pi
 import pytest
 
 
-def test_an_unknown_axis_is_refused_with_those_of_the_model():
+def test_an_unknown_axis_and_an_interval_of_another_type_are_refused():
     v = 5 - 5 * np.cos(np.arange(500) / 50)
     record = pi.Record.from_arrays(v, PAPER.simulate(v), sample_rate=FS)
     with pytest.raises(pi.DataError, match=r'axes: the model has no axis z; give a list of y$'):
@@ -18,10 +18,5 @@ def test_an_unknown_axis_is_refused_with_those_of_the_model():
     assert pi.free_run(PAPER, record, axes=['y']).errors.percent < 0.01
     with pytest.raises(pi.DataError, match=r'no axis z; give a list of y, y_b$'):
         pi.free_run(scanner(), play(v, v), axes=['y', 'z'])
-
-
-def test_an_interval_of_another_type_is_refused():
-    v = 5 - 5 * np.cos(np.arange(500) / 50)
-    record = pi.Record.from_arrays(v, PAPER.simulate(v), sample_rate=FS)
     with pytest.raises(pi.DataError, match='interval: expected Real, got str; give a level'):
         pi.free_run(PAPER, record, '0.9')
