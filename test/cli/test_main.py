@@ -389,9 +389,6 @@ def test_shipped_files_are_found_by_name_and_by_path(capsys, tmp_path, monkeypat
         find_config('owner', 'program')
 
 
-# --- interrupted ----------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def on_a_terminal(argv: list[object]) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
     """Run a command whose standard error is a terminal; yield it and the terminal's other end."""

@@ -105,8 +105,6 @@ def test_what_is_there_is_not_replaced_unasked(tmp_path):
         write_text(tmp_path / 'no folder' / 'out', 'new')
 
 
-# --- YAML -----------------------------------------------------------------------------------
-
 ALIASES = 'a0: &a0 [1, 1]\n' + ''.join(
     f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n' for i in range(1, 40)
 )

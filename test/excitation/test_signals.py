@@ -49,9 +49,6 @@ def band_power(x, fs, low, high):
     return spectrum[(f >= low) & (f < high)].sum()
 
 
-# -- signals -----------------------------------------------------------------------------------
-
-
 def test_paper_triangle_is_equation_7():
     v = ex.triangle(ex.PAPER_PEAKS, 0.0, ex.PAPER_SLOPE, FS)
     assert v.size == 6 * FS
@@ -190,9 +187,6 @@ def test_decaying_triangle_shrinks_to_its_bias():
     v = part({'signal': 'decaying_triangle', 'bias': 5, 'amplitude': 5, 'cycles': 5, 'slope': 20})
     turns = v[1:-1][(np.sign(np.diff(v))[1:] != np.sign(np.diff(v))[:-1])]
     assert_allclose(turns, [10, 0, 9, 1, 8, 2, 7, 3, 6, 4], atol=1e-9)
-
-
-# -- programs --------------------------------------------------------------------------------
 
 
 def signal(name: str, **options: object) -> st.SearchStrategy:

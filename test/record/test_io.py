@@ -195,9 +195,6 @@ def test_a_folder_that_is_no_bag_or_holds_more_is_never_replaced(
     assert (path / other).exists()
 
 
-# --- CSV
-
-
 def test_csv_as_spreadsheets_write_it(tmp_path):
     path = tmp_path / 'r.CSV'
     text = csv_text(segment=[' noise '] * 300, x_temp=[21.5] * 300, comment=['-'] * 300)
@@ -312,9 +309,6 @@ def test_a_quoted_cell_may_go_on_over_the_rows_that_are_read_together(tmp_path):
     assert piece.n == 70000
 
 
-# --- npz and mat
-
-
 def save(path: Path, arrays: dict) -> None:
     if path.suffix == '.npz':
         np.savez(path, **arrays)
@@ -421,9 +415,6 @@ def test_links_that_lead_nowhere(tmp_path, name):
     path = tmp_path / 'link.csv'
     path.symlink_to('there.csv')
     assert pi.read(path).n == 300
-
-
-# --- measured files
 
 
 @pytest.mark.parametrize(

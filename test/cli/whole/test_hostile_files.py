@@ -109,9 +109,6 @@ def test_no_right_to_read(tmp_path, record, monkeypatch, capsys):
     assert capsys.readouterr().err.count('\n') == 3
 
 
-# --- tables ---------------------------------------------------------------------------------
-
-
 def test_more_than_a_file_may_hold(tmp_path, record, monkeypatch):
     pi.write(record, tmp_path / 'r.npz')
     monkeypatch.setattr('piezo_ident.record.tables.arrays.UNPACKED_SIZE', 1000)
@@ -152,9 +149,6 @@ def test_other_variables_of_a_workspace_are_left_alone(tmp_path, packed):
     assert {f.where for f in read.faults} == {repr(k) for k in others}
     scipy.io.savemat(path, {'t': t, 'v': deep, 'y': 1e-6 * t})
     refused(lambda: pi.read(path), 'v holds', kind=DataError)
-
-
-# --- programs and models --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

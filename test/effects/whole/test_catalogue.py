@@ -46,9 +46,6 @@ def with_setting(name: str, values: dict):
     return replace(PAPER, effects=(EffectSetting(name, values),))
 
 
-# -- what is declared --------------------------------------------------------------------------
-
-
 def test_what_is_tested_here_is_in_the_catalogue():
     own = {n for n, e in catalogue().items() if e.__module__.startswith('piezo_ident.')}
     assert set(VISIBLE) == own
@@ -80,9 +77,6 @@ def test_effect_is_declared_in_full(name):
 def test_effects_that_are_driven_by_time_say_so():
     driven = {name for name in EVERY if catalogue()[name].time_driven}
     assert driven == {'gain_drift', 'periodic_disturbance', 'thermal_drift'}
-
-
-# -- nothing ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('name', EVERY)
@@ -158,9 +152,6 @@ def test_reset_forgets_everything(name):
     assert_array_equal(effect.process(block).x, first)
 
 
-# -- blocks and files --------------------------------------------------------------------------
-
-
 @settings(deadline=None, max_examples=80)
 @given(
     cuts=st.lists(st.integers(0, 4000), max_size=8),
@@ -196,9 +187,6 @@ def test_saving_and_loading_neutral_values_changes_nothing(name, tmp_path):
     again = load(tmp_path / 'model.yaml')
     assert model_to_dict(again)['effects'] == model_to_dict(model)['effects']
     assert_array_equal(played(again, signal()), played(PAPER, signal()))
-
-
-# -- refusals ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -254,9 +242,6 @@ def test_missing_and_unknown_parameters_are_refused(name):
 def test_values_that_contradict_each_other_are_refused(name, change, says):
     with pytest.raises(ModelError, match=says):
         find_effect(name)(FS, {**VISIBLE[name], **change}, H)
-
-
-# -- trials ------------------------------------------------------------------------------------
 
 
 def columns(effect: type[Effect], trial: Trial, v: np.ndarray) -> list[np.ndarray]:

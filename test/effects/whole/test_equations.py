@@ -21,9 +21,6 @@ def step(n: int, at: int = 10) -> np.ndarray:
     return (np.arange(n) >= at).astype(float)
 
 
-# -- the amplifier -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize('tau', [2e-5, 1e-3, 0.05])
 def test_lag_rises_like_its_exponential(tau):
     y = alone('amplifier_lag', {'time_constant': tau}, step(3000))
@@ -66,9 +63,6 @@ def test_saturation_with_one_end_leaves_the_other():
     assert_allclose(y[u < -10], u[u < -10], atol=1e-12)
 
 
-# -- creep -------------------------------------------------------------------------------------
-
-
 def test_creep_is_its_exponentials():
     values = {'gain': [0.02, 0.0, -0.01], 'time_constant': [0.01, 0.2, 3.0]}
     t = np.arange(1, 4001) / FS
@@ -100,9 +94,6 @@ def test_creep_goes_on_in_the_direction_of_the_step(gain, can_be):
 def test_coupling_is_no_drift(frequency, damping, can_be):
     values = {'frequency': frequency, 'damping': damping}
     assert find_effect('cross_coupling').is_plausible(values) == can_be
-
-
-# -- rate dependence ---------------------------------------------------------------------------
 
 
 def plainly(u, fs, gain, exponent, cutoff, stretch=0.0, memory=None):
@@ -208,9 +199,6 @@ def test_rate_dependence_of_parts_of_h_adds_up(name):
     assert np.abs(theta @ found - h(u, start)).max() > 1e-3
 
 
-# -- the static curve and the minor loops ------------------------------------------------------
-
-
 def test_even_nonlinearity_is_its_powers():
     u = signal() / 10
     y = alone('even_nonlinearity', {'square': 0.02, 'fourth': -0.03}, u)
@@ -252,9 +240,6 @@ def test_preload_is_a_kink_at_one_voltage():
     effect = find_effect('preload_loss')(FS, {'gain': 0.05, 'threshold': 0.3})
     block = Block(np.arange(3) / FS, np.array([0.1, 0.3, 0.9]), np.array([7.0, 8.0, 9.0]))
     assert_allclose(effect.process(block).x, [6.99, 8.0, 9.0], atol=1e-15)
-
-
-# -- several in the slot of H ------------------------------------------------------------------
 
 
 class Square(Effect):

@@ -41,9 +41,6 @@ def mode(f: np.ndarray, own: float, damping: float) -> tuple[np.ndarray, np.ndar
     return 1 / below, s / below
 
 
-# -- modes -------------------------------------------------------------------------------------
-
-
 def test_changed_dynamics_have_their_frequency_response():
     f = np.array([1.0, 50.0, 390.0, 400.0, 410.0, 1000.0, 2500.0, 6000.0])
     values = VISIBLE['changed_dynamics']
@@ -94,9 +91,6 @@ def test_a_resonance_that_moved_is_of_this_form(old, ratio, damping):
     assert_allclose(alone('changed_dynamics', values, before), after, atol=1e-9 * scale)
 
 
-# -- sensor and play ---------------------------------------------------------------------------
-
-
 def test_sensor_is_its_polynomial_of_the_displacement():
     model = with_effects('sensor_nonlinearity')
     v = signal()
@@ -117,9 +111,6 @@ def test_backlash_loses_a_way_of_twice_its_width_after_a_turn():
     assert_allclose(half, (u + y) / 2, atol=1e-12)
     # symmetric: upside down it is the same
     assert_allclose(alone('backlash', {'width': 0.05, 'gain': 1.0}, -u), -y, atol=1e-12)
-
-
-# -- the other axis ----------------------------------------------------------------------------
 
 
 def test_cross_coupling_has_its_static_gain_and_its_resonance():
@@ -165,9 +156,6 @@ def test_cross_coupling_in_a_record_is_that_of_the_stream():
     assert_array_equal(free_run(model, record).pieces[0], played(model, v))
 
 
-# -- hum, drift and gain: driven by time -------------------------------------------------------
-
-
 def test_hum_has_the_lines_and_phases_it_was_given():
     n = 20_000
     x = alone('periodic_disturbance', VISIBLE['periodic_disturbance'], np.zeros(n))
@@ -205,9 +193,6 @@ def test_gain_is_that_of_its_knots_and_of_the_last_one_beyond():
         assert alone('gain_drift', values, np.full(1, 0.6), t0=t0)[0] == pytest.approx(
             0.6 * (1 + gain), abs=1e-15
         )
-
-
-# -- what joins at the sensor ------------------------------------------------------------------
 
 
 def test_feedthrough_is_command_and_rate_without_the_delay():
@@ -266,9 +251,6 @@ def test_delay_change_leaves_what_joins_behind_it():
         model = replace(PAPER, effects=order)
         same = with_effects('input_feedthrough', model=replace(PAPER, delay=Delay(5)))
         assert_array_equal(played(model, v), played(same, v))
-
-
-# -- time jumps --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('name', ['gain_drift', 'periodic_disturbance', 'thermal_drift'])

@@ -116,9 +116,6 @@ def test_unknown_type_is_refused(tmp_path):
     writer.abort()
 
 
-# --- parts -----------------------------------------------------------------------------------
-
-
 def recorded(path, storage, parts_of, blocks=60):
     """Write pairs of blocks, flushed after every fifth."""
     writer = BagWriter(path, storage, {'sample_rate': repr(RATE)}, parts_of)
