@@ -265,8 +265,9 @@ def test_every_program_keeps_its_promises_or_is_refused(items, rest):
 
 
 @pytest.mark.parametrize('name', CONFIG)
-def test_programs_that_come_along(name):
-    s = Program.load(name).build()
+def test_programs_that_come_along_and_over_another_range(name):
+    program = Program.load(name)
+    s = program.build()
     assert s.sample_rate == FS
     assert np.all((s.v >= 0.0) & (s.v <= 10.0))
     assert s.v[0] == s.v[-1] == 0.0
@@ -277,7 +278,16 @@ def test_programs_that_come_along(name):
     ]
     # any rate will do
     rate = 10_000 if name.startswith('identification') else 5000
-    assert Program.load(name).build(rate).duration == pytest.approx(s.duration, rel=1e-2)
+    assert program.build(rate).duration == pytest.approx(s.duration, rel=1e-2)
+    # the same motion over another range; a level may be in a label
+    other = scaled(program, (-20.0, 120.0), FS).build()
+    assert [x.n for x in other.segments] == [x.n for x in s.segments]
+    assert [x.kind for x in other.segments] == [x.kind for x in s.segments]
+    assert_allclose(other.v, -20.0 + 14.0 * s.v, atol=1e-6)
+    # what a slow rate cannot carry is left out
+    slow = scaled(program, (0.0, 100.0), 500.0).build()
+    assert slow.duration == pytest.approx(s.duration, rel=0.1)
+    assert (slow.v.min(), slow.v.max()) == pytest.approx((0.0, 10.0 * s.v.max()), rel=0.02)
 
 
 def test_identification_program_has_what_the_three_steps_need():
@@ -344,20 +354,6 @@ def test_limits_of_the_caller_only_narrow():
         p.build(1000, limits=(1, 9))
     # a signal that follows the range follows the narrower one
     assert program({'signal': 'triangle'}).build(1000, limits=(0, 6)).v.max() == 6.0
-
-
-@pytest.mark.parametrize('name', CONFIG)
-def test_a_scaled_program_is_the_same_motion_over_another_range(name):
-    one = Program.load(name).build(FS)
-    other = scaled(Program.load(name), (-20.0, 120.0), FS).build()
-    assert [s.n for s in other.segments] == [s.n for s in one.segments]
-    # a level may be in a label
-    assert [s.kind for s in other.segments] == [s.kind for s in one.segments]
-    assert_allclose(other.v, -20.0 + 14.0 * one.v, atol=1e-6)
-    # what a slow rate cannot carry is left out
-    slow = scaled(Program.load(name), (0.0, 100.0), 500.0).build()
-    assert slow.duration == pytest.approx(one.duration, rel=0.1)
-    assert (slow.v.min(), slow.v.max()) == pytest.approx((0.0, 10.0 * one.v.max()), rel=0.02)
 
 
 def test_a_signal_with_voltages_of_its_own_is_not_scaled():
