@@ -62,11 +62,14 @@ def test_an_effect_takes_most_of_what_the_best_h_leaves(given, share, names):
     assert taken(given.and_these([found('creep', left=share * WHOLE)])) == names
 
 
-def test_blocks_and_kinds_of_motion_count_alike(given):
+def test_blocks_and_kinds_of_motion_count_alike_but_kinds_alone_beside_another_effect(given):
     own = found('creep', left=0.1 * WHOLE, kinds=1.5 * WHOLE)
     assert given.left(own) == pytest.approx(np.sqrt(0.15) * WHOLE, rel=1e-2)
     assert taken(given.and_these([own])) == ('creep',)
     assert taken(given.and_these([replace(own, fitted=fit(0.1 * WHOLE, 2.0 * WHOLE))])) == ()
+    one = given.and_these([found('creep', left=0.3 * WHOLE)])
+    kinds = found('creep', 'backlash', left=0.15 * WHOLE, kinds=0.05 * WHOLE)
+    assert taken(one.and_these([kinds])) == ('creep',)
 
 
 def test_it_is_larger_than_the_smallest_effect(given):
@@ -76,20 +79,11 @@ def test_it_is_larger_than_the_smallest_effect(given):
     assert taken(small.and_these([found('creep', left=0.25 * least)])) == ()
 
 
-def test_each_of_a_pair_takes_most_of_the_rest(given):
+def test_each_of_a_pair_takes_most_of_the_rest_also_where_no_single_one_does(given):
     one = given.and_these([found('creep', left=0.3 * WHOLE), found('backlash', left=0.9 * WHOLE)])
     assert taken(one.and_these([found('creep', 'backlash', left=0.13 * WHOLE)])) == ('creep',)
     both = one.and_these([found('creep', 'backlash', left=0.11 * WHOLE)])
     assert taken(both) == ('backlash', 'creep')
-
-
-def test_beside_another_effect_kinds_of_motion_alone_speak_for_none(given):
-    one = given.and_these([found('creep', left=0.3 * WHOLE)])
-    kinds = found('creep', 'backlash', left=0.15 * WHOLE, kinds=0.05 * WHOLE)
-    assert taken(one.and_these([kinds])) == ('creep',)
-
-
-def test_a_pair_is_found_where_no_single_one_is(given):
     alone = [found('creep', left=0.6 * WHOLE), found('backlash', left=0.7 * WHOLE)]
     assert taken(given.and_these(alone)) == ()
     both = [*alone, found('creep', 'backlash', left=0.1 * WHOLE)]

@@ -43,9 +43,10 @@ LARGE = '{signal: sine, name: 80Hz-large, bias: 5, amplitude: 4, frequency: 80, 
 SMALL = '{signal: sine, name: 80Hz-small, bias: 5, amplitude: 1, frequency: 80, duration: 0.1}'
 
 
-def test_without_data_it_is_sweeps_and_then_nothing():
+def test_without_data_it_is_sweeps_and_then_nothing_nor_is_it_where_nothing_is_missing():
     assert next_experiment(None).kind == 'sweeps'
     assert next_experiment(None, asked=('sweeps',)) is None
+    assert next_experiment(replace(example('none'), untestable=()), [played(SINE)]) is None
 
 
 @pytest.mark.parametrize('effect', ['creep', 'rate_dependent_hysteresis', 'thermal_drift'])
@@ -85,10 +86,6 @@ def test_something_unexplained_asks_for_all_motions_one_after_the_other():
         asked.append(wanted.kind)
         records.append(shipped('diagnosis' if wanted.kind == 'sweeps' else 'holds'))
     assert sorted(asked) == ['holds', 'sweeps']
-
-
-def test_nothing_missing_asks_for_nothing():
-    assert next_experiment(replace(example('none'), untestable=()), [played(SINE)]) is None
 
 
 def test_what_was_asked_for_in_vain_is_not_asked_again():

@@ -49,16 +49,13 @@ def band_power(x, fs, low, high):
     return spectrum[(f >= low) & (f < high)].sum()
 
 
-def test_paper_triangle_is_equation_7():
+def test_paper_triangle_is_equation_7_and_the_default_one_covers_its_range():
     v = ex.triangle(ex.PAPER_PEAKS, 0.0, ex.PAPER_SLOPE, FS)
     assert v.size == 6 * FS
     peaks = v[1:-1][(v[1:-1] > v[:-2]) & (v[1:-1] > v[2:])]
     assert peaks.tolist() == [3.0, 6.0, 9.0]
     assert_allclose(np.abs(np.diff(v)) * FS, 6.0, rtol=1e-9)
     assert_allclose(v[[0, 10_000, 20_000]], [0.0, 3.0, 0.0], atol=1e-12)
-
-
-def test_default_triangle_covers_the_range_it_is_given():
     for limits in ([0, 10], [-10, 10], [-2, 7.7]):
         s = program({'signal': 'triangle'}, limits=limits, rest=limits[0]).build(FS)
         assert (s.v.min(), s.v.max()) == tuple(limits)
@@ -174,16 +171,13 @@ def test_noise_after_the_sweep_does_not_ratchet_the_plays():
     assert np.ptp(memory, axis=1).max() == 0.0
 
 
-def test_steps_go_up_and_down_and_stairs_hold():
+def test_steps_go_up_and_down_stairs_hold_and_a_decaying_triangle_shrinks_to_its_bias():
     v = part({'signal': 'step', 'bias': 5, 'size': 1, 'hold': 0.1, 'count': 10})
     jumps = np.diff(v)
     assert_array_equal(np.unique(v), [4.5, 5.5])
     assert (np.sum(jumps > 0), np.sum(jumps < 0)) == (5, 5)
     assert np.diff(np.flatnonzero(jumps)).tolist() == [2000] * 9
     assert ex.staircase([0, 2, 1], [0.1, 0.2, 0.3], 10.0).tolist() == [0, 2, 2, 1, 1, 1]
-
-
-def test_decaying_triangle_shrinks_to_its_bias():
     v = part({'signal': 'decaying_triangle', 'bias': 5, 'amplitude': 5, 'cycles': 5, 'slope': 20})
     turns = v[1:-1][(np.sign(np.diff(v))[1:] != np.sign(np.diff(v))[:-1])]
     assert_allclose(turns, [10, 0, 9, 1, 8, 2, 7, 3, 6, 4], atol=1e-9)

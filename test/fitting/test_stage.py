@@ -66,15 +66,12 @@ def test_each_column_is_the_derivative_by_its_value(name):
             np.testing.assert_allclose(found, expected, atol=tolerance * max(1, abs(found).max()))
 
 
-def test_values_make_the_same_stage_again():
+def test_values_make_the_same_stage_again_and_an_unstable_G_is_refused():
     one = stage_of('preisach')
     again = one.moved(one.values)
     for s in stretches():
         np.testing.assert_allclose(again.signals(s)[2], one.signals(s)[2], atol=1e-12)
     np.testing.assert_allclose(again.values, one.values, atol=1e-12)
-
-
-def test_an_unstable_G_is_refused():
     one = stage_of()
     values = one.values
     at = one.law.size + one.creep.size

@@ -234,9 +234,11 @@ def test_a_given_delay_is_used_and_labelled_even_where_another_errs_less(delay):
     assert dict(facts(result))['delay'].startswith(f'{delay} samples (given)')
 
 
-def test_a_given_delay_of_most_of_the_record_is_refused():
+def test_a_delay_of_most_of_the_record_and_a_swarm_without_labels_are_refused():
     with pytest.raises(IdentificationError, match='--delay'):
         identify(slow_record(3), Settings(delay=500))
+    with pytest.raises(ConfigError, match='label'):
+        identify(slow_record(3), Settings(solver='swarm'))
 
 
 def test_slow_motion_of_many_sizes_tells_a_long_delay():
@@ -244,8 +246,3 @@ def test_slow_motion_of_many_sizes_tells_a_long_delay():
     assert (result.delay.samples, result.delay.source) == (3, 'free run')
     assert result.model.delay.total == 3
     assert list(dict(result.not_identified)) == ['dynamics']
-
-
-def test_the_swarm_needs_labels():
-    with pytest.raises(ConfigError, match='label'):
-        identify(slow_record(3), Settings(solver='swarm'))

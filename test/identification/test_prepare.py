@@ -45,9 +45,13 @@ def test_rates_that_differ_by_rounding_are_one():
     assert len(runs_of([record(one, two)], rate, scaling_of([one, two]))) == 2
 
 
-def test_voltage_that_never_moves_is_refused():
+def test_a_voltage_that_never_moves_and_nothing_to_scale_are_refused():
     with pytest.raises(IdentificationError, match='never moves'):
         common_rate([record(piece(np.full(100, 3.0)))])
+    with pytest.raises(IdentificationError, match='constant'):
+        scaling_of([piece(np.full(9, 2.0), np.arange(9.0))])
+    with pytest.raises(IdentificationError, match='displacement is constant'):
+        scaling_of([piece(RAMP, np.full(1001, 1e-6))])
 
 
 @pytest.mark.parametrize('gain', [7.5e-6, -7.5e-6])
@@ -66,13 +70,6 @@ def test_scaling_of_several_pieces_spans_them_all():
     s = scaling_of([piece(RAMP / 2), piece(RAMP)])
     assert s.V == 10.0
     assert pytest.approx(75e-6) == s.Y
-
-
-def test_nothing_to_scale_is_refused():
-    with pytest.raises(IdentificationError, match='constant'):
-        scaling_of([piece(np.full(9, 2.0), np.arange(9.0))])
-    with pytest.raises(IdentificationError, match='displacement is constant'):
-        scaling_of([piece(RAMP, np.full(1001, 1e-6))])
 
 
 def run_of(v, *segments, rate=1000.0):

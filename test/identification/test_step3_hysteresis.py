@@ -40,16 +40,13 @@ def fitted(*excerpts, r=TEN, **options):
     return fit_hysteresis(factorise(excerpts, r, G, D), r, n, rows=rows, **options)
 
 
-def test_noise_free_triangle_gives_the_weights_back():
+def test_noise_free_triangles_give_the_weights_and_an_offset_each_back():
     fit = fitted(excerpt(offset=0.25))
     assert_allclose(fit.hysteresis.weights, Q[1:], atol=1e-7)
     assert fit.hysteresis.p1 == pytest.approx(-0.2774, abs=1e-7)
     assert fit.hysteresis.p2 == pytest.approx(0.6232 + 0.4777, abs=1e-7)
     assert_allclose(fit.offsets, [0.25], atol=1e-7)
     assert fit.rms < 1e-7
-
-
-def test_each_excerpt_has_an_offset_of_its_own():
     fit = fitted(excerpt(offset=0.25), excerpt(peaks=(1.0,), offset=-7.0), excerpt(offset=100.0))
     assert_allclose(fit.offsets, [0.25, -7.0, 100.0], atol=1e-6)
     assert_allclose(fit.hysteresis.weights, Q[1:], atol=1e-6)

@@ -37,14 +37,11 @@ def test_what_is_in_order_passes_bit_for_bit():
     assert guard.process(v).voltage.tobytes() == v.tobytes()
 
 
-def test_what_is_wrong_is_altered_and_counted():
+def test_what_is_wrong_is_altered_and_counted_and_no_number_at_all_leaves_the_drive():
     guard = Guard(USUAL)
     out = guard.process([0.0, 0.5, math.nan, math.inf, 1.0, -1.0, 3.0])
     assert out.voltage.tolist() == [0.0, 0.5, 0.5, 0.5, 1.0, 0.0, 1.0]
     assert out.altered == {'not_finite': 2, 'outside_limits': 1, 'too_fast': 1}
-
-
-def test_no_number_at_all_leaves_the_drive_where_it_is():
     guard = Guard(USUAL, applied=4.0)
     out = guard.process([math.nan] * 3)
     assert out.voltage.tolist() == [4.0] * 3

@@ -190,8 +190,10 @@ def test_how_the_streams_are_cut_does_not_matter_to_what_follows(size):
     assert np.abs(one[1] - run_of('off', **case)[1]).max() > 0.1
 
 
-def test_what_follows_costs_nothing_where_nothing_changed():
+def test_what_follows_costs_nothing_where_nothing_changed_or_is_read():
     assert np.abs(run_of('gain')[2] - run_of('off')[2]).max() < 0.02
+    alone, lost = run_of('off')[1], run_of('gain', readings=lambda y: np.full(y.size, np.nan))[1]
+    assert np.array_equal(alone, lost)
 
 
 def test_a_sensor_at_fault_moves_the_stage_by_a_tenth_of_its_stroke_at_most():
@@ -201,11 +203,6 @@ def test_a_sensor_at_fault_moves_the_stage_by_a_tenth_of_its_stroke_at_most():
     assert np.abs(error).max() < 100.0 * 0.105 * abs(CREEPS.scaling.Y) / span
     assert tracker.followers[0].is_limited
     assert np.abs(np.diff(v)).max() <= SETTINGS.step * (1 + 1e-9)
-
-
-def test_without_readings_it_goes_on_as_alone():
-    alone, lost = run_of('off')[1], run_of('gain', readings=lambda y: np.full(y.size, np.nan))[1]
-    assert np.array_equal(alone, lost)
 
 
 def test_another_model_takes_over_and_is_followed_anew():

@@ -18,12 +18,9 @@ ROWS = [
 ]
 
 
-def test_columns_keep_their_order():
+def test_columns_keep_their_order_and_numbers_are_read_back_exactly():
     known = ['record', 'status', 'reason', 'stroke']
     assert columns_of(ROWS) == [*known, 'r1', 'q1', 'r2', 'q2', 'creep.share', 'warnings']
-
-
-def test_numbers_are_read_back_exactly():
     lines = list(csv.DictReader(io.StringIO(csv_text(ROWS))))
     assert float(lines[0]['stroke']) == 7e-5
     assert lines[2]['status'] == 'failed' and lines[2]['stroke'] == ''

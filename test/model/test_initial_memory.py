@@ -75,13 +75,10 @@ def test_memory_is_one_that_can_be():
     assert np.all(found >= u0 - r - 1e-12)
 
 
-def test_without_plays_there_is_no_memory():
+def test_no_plays_a_few_samples_and_no_movement_will_do():
     for h in (Hysteresis([], [], 0, 1), Hysteresis([0.2], [0.0], 0, 1)):
         model = replace(PAPER, hysteresis=h)
         assert fit_start(model, started_from(None, model)).memory.shape == h.thresholds.shape
-
-
-def test_a_few_samples_and_no_movement_will_do():
     for piece in (Piece(V[:5], V[:5] * 7.5e-6, FS), Piece(np.full(50, 5.0), np.zeros(50), FS)):
         found = fit_start(PAPER, piece).memory
         assert np.all(np.isfinite(found))
@@ -118,15 +115,12 @@ def test_after_it_the_start_no_longer_matters(seed):
     assert_allclose(one[:, k:], two[:, k:], atol=1e-12)
 
 
-def test_rest_is_at_the_lowest_voltage():
+def test_rest_is_at_the_lowest_voltage_and_only_an_unknown_start_is_estimated():
     zero = np.zeros(5)
     assert is_at_rest(PAPER, Piece(zero, zero, FS))
     assert is_at_rest(PAPER, Piece(zero + 0.05, zero, FS))
     assert not is_at_rest(PAPER, Piece(zero + 5, zero, FS))
     assert not is_at_rest(PAPER, Piece(zero - 5, zero, FS))
-
-
-def test_only_an_unknown_start_is_estimated():
     zero = np.zeros(50)
     assert fit_start(PAPER, Piece(zero, zero, FS)) is None
     assert fit_start(PAPER, started_from(None)).memory.shape == PAPER.hysteresis.thresholds.shape

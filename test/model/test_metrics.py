@@ -21,20 +21,14 @@ import pytest
 Y = np.array([0.0, 1.0, 2.0, 4.0])
 
 
-def test_percent_of_stroke_by_hand():
+def test_percent_of_stroke_and_fit_by_hand_and_without_a_stroke():
     # errors 0, 0, 0, 0.4: rms 0.2, stroke 4
     assert percent_of_stroke(Y, Y - [0, 0, 0, 0.4]) == pytest.approx(5.0)
     assert percent_of_stroke(Y, Y - [0, 0, 0, 0.4], stroke=2.0) == pytest.approx(10.0)
-
-
-def test_fit_is_that_of_compare():
     # a prediction by the mean fits by 0 %, a perfect one by 100 %
     assert fit_percent(Y, np.full(4, Y.mean())) == pytest.approx(0.0)
     assert fit_percent(Y, Y) == 100.0
     assert fit_percent(Y, 2 * Y.mean() - Y) == pytest.approx(-100.0)
-
-
-def test_no_stroke_is_no_division_by_zero():
     still = np.ones(4)
     assert percent_of_stroke(still, still) == 0.0
     assert percent_of_stroke(still, still + 1) == float('inf')

@@ -17,16 +17,13 @@ P1, P2 = -0.2774, 0.6232
 PAPER = Hysteresis(R, Q, P1, P2)
 
 
-def test_weight_at_zero_is_folded_into_the_linear_term():
+def test_weight_at_zero_is_folded_into_the_linear_term_and_the_stroke_is_the_papers():
     assert PAPER.thresholds[0] == 0.1
     assert PAPER.thresholds.size == PAPER.weights.size == 9
     assert PAPER.p2 == pytest.approx(P2 + 0.4777)
     apart = Hysteresis(R[1:], Q[1:], P1, P2 + 0.4777)
     v = np.random.default_rng(1).uniform(0, 1, 300)
     assert_allclose(PAPER(v), apart(v), atol=1e-15)
-
-
-def test_full_stroke_is_that_of_the_papers_numbers():
     # p1 + p2 + sum q (1 - r) = 1.483 at v = 1: 71 um of 75 um behind G(1) = 0.641
     full = P1 + P2 + np.dot(Q, 1 - R)
     assert full == pytest.approx(1.483, abs=5e-4)

@@ -219,12 +219,9 @@ def test_lost_samples_and_gaps_show_among_stamps_that_scatter(by):
     assert faults(record) == {'timing_jitter': 4, 'gap': 3}
 
 
-def test_regular_losses_are_no_scatter():
+def test_regular_losses_are_no_scatter_and_no_rates_are_made_of_jitter():
     with pytest.raises(DataError, match='not uniformly sampled'):
         read([np.delete(x, np.s_[::4]) for x in columns(1000, rate=3000.0)])
-
-
-def test_no_rates_are_made_of_jitter():
     # two rates, both with jitter
     first, late = scattered(5000, 0.2), scattered(5000, 0.2)
     late[0] = first[0][-1] + 4 * (late[0] - late[0][0] + 1 / RATE)

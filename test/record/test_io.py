@@ -389,18 +389,15 @@ def test_array_that_announces_too_much(tmp_path):
     refuse(path, 'damaged')
 
 
-def test_matlab_73(tmp_path):
-    path = tmp_path / 'r.mat'
-    path.write_bytes(b'MATLAB 7.3 MAT-file'.ljust(512) + b'\x89HDF\r\n\x1a\n' + bytes(600))
-    refuse(path, 'save -v7')
-
-
-def test_what_is_not_there_or_unknown(tmp_path):
+def test_what_is_not_there_unknown_or_of_matlab_73(tmp_path):
     refuse(tmp_path / 'r.csv', 'does not exist')
     refuse(tmp_path / 'r_bag', 'does not exist')
     refuse(tmp_path, 'metadata.yaml')
     (tmp_path / 'r.xls').touch()
     refuse(tmp_path / 'r.xls', 'unknown format .xls')
+    path = tmp_path / 'r.mat'
+    path.write_bytes(b'MATLAB 7.3 MAT-file'.ljust(512) + b'\x89HDF\r\n\x1a\n' + bytes(600))
+    refuse(path, 'save -v7')
 
 
 @pytest.mark.parametrize('name', ['r.csv', 'r.mcap', 'bag'])

@@ -39,15 +39,12 @@ def test_nothing_but_noise_depends_on_nothing():
     assert np.mean(np.abs(curve.mean) < 2.5 * curve.std) > 0.8
 
 
-def test_dependence_on_voltage_and_direction():
+def test_dependence_on_voltage_direction_and_speed():
     direction = np.sign(np.gradient(V))
     up, down = curves(analyse([part_of(noise() + 1e-8 * np.cos(V) + 5e-9 * direction)]), 'v')
     assert (up.branch, down.branch) == ('up', 'down')
     np.testing.assert_allclose(up.mean, 1e-8 * np.cos(up.x) + 5e-9, atol=3e-9)
     np.testing.assert_allclose(down.mean, 1e-8 * np.cos(down.x) - 5e-9, atol=3e-9)
-
-
-def test_dependence_on_speed():
     curve = curves(analyse([part_of(noise() + 1e-11 * np.gradient(V) * RATE)]), 'dv/dt')[0]
     # only the slope over the bins counts: within one the speed varies
     assert np.polyfit(curve.x, curve.mean, 1)[0] == pytest.approx(1e-11, rel=0.05)

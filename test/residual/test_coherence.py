@@ -31,14 +31,11 @@ def test_false_alarms_of_the_coherence():
     assert np.mean([c.share for c in bound]) < 0.02
 
 
-def test_the_coherent_share_is_all_but_the_noise():
+def test_the_coherent_share_is_all_but_the_noise_and_too_little_data_give_none():
     v = noise()
     e = 0.2 * np.roll(v, 7) + 0.05 * np.random.default_rng(4).standard_normal(N)
     share = 0.04 * v.var() / (0.04 * v.var() + 0.0025)
     assert coherence([part(v, e)]).share == pytest.approx(share, abs=0.1)
-
-
-def test_too_little_data_give_nothing():
     assert coherence([part(np.arange(40.0), np.zeros(40))]) is None
 
 

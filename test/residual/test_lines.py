@@ -121,12 +121,9 @@ def test_a_sweep_of_one_frequency_is_drive_not_hum():
     assert search(ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)).lines == ()
 
 
-def test_no_noise_at_all_makes_no_lines():
+def test_no_noise_at_all_makes_no_lines_and_too_little_is_not_searched():
     assert search(part_of(misfit(V))).lines == ()
     assert search(part_of(np.zeros(V.size))).lines == ()
-
-
-def test_too_short_for_a_search():
     part = ResidualPart('r', Piece(V[:300], Y_HAT[:300], RATE, 0.0), np.ones(300))
     found = search(part)
     assert found.lines == ()

@@ -13,14 +13,11 @@ from residual_data import creep, misfit, part_of, pink, RATE, V
 from scipy.signal import lfilter
 
 
-def test_stretches_of_a_program():
+def test_stretches_of_a_program_are_found_and_repeats_without_labels():
     found = [(s.kind, s.period) for s in stretches_of(part_of(np.zeros(V.size)))]
     # rest, 1 Hz, 50 Hz (40 samples at 2 kHz), noise; four holds start with their first sample
     assert found[:4] == [('rest', 0), ('repeat', 2000), ('repeat', 40), ('motion', 0)]
     assert found[4:8] == [('rest', 0)] * 4
-
-
-def test_repeats_are_found_without_labels():
     kinds = {s.period for s in stretches_of(part_of(np.zeros(V.size), labelled=False))}
     assert {2000, 40} <= kinds
 

@@ -100,13 +100,10 @@ def test_a_stage_may_be_told_to_stand_still(level):
     assert drive.lead == 0 and not drive.warnings
 
 
-def test_a_motion_may_begin_and_turn_at_a_limit():
+def test_a_motion_may_begin_and_turn_at_a_limit_and_begin_beyond_it_where_clipping_is_asked_for():
     drive = pi.invert(PAPER, 20e-6 * (1 - np.cos(2 * np.pi * 20 * T)))
     assert drive.v.min() == 0.0 and drive.error < 0.001
     assert not drive.clipped.any() and not drive.warnings
-
-
-def test_what_begins_out_of_reach_is_clipped_where_that_is_asked_for():
     drive = pi.invert(PAPER, SINE - 16e-6, clip=True)
     assert drive.v[0] == 0.0 and drive.clipped[drive.lead]
     assert '1 um' in drive.warnings[0] and len(drive.warnings) == 1

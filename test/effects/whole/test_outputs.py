@@ -228,14 +228,11 @@ def test_delay_changes_either_way_by_samples_and_fractions(delta, delay, same):
     assert_array_equal(moved(delta, delay, v=v), played(replace(PAPER, delay=same), v))
 
 
-def test_several_changes_of_the_delay_add_up():
+def test_changes_of_the_delay_add_up_and_one_below_nothing_is_refused():
     effects = tuple(EffectSetting('delay_change', {'samples': x}) for x in (1.5, -0.5))
     model, v = replace(PAPER, effects=effects), signal()
     assert model.total_delay == Delay(4)
     assert_array_equal(played(model, v), played(replace(PAPER, delay=Delay(4)), v))
-
-
-def test_delay_below_nothing_is_refused():
     model = replace(PAPER, effects=(EffectSetting('delay_change', {'samples': -3.1}),))
     with pytest.raises(ModelError, match=r'3 samples cannot change by -3\.1'):
         model.stream()

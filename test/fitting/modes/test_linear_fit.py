@@ -90,13 +90,10 @@ def test_an_axis_of_a_short_stroke_is_fitted_as_well():
         assert error == pytest.approx(0.01, rel=0.2)
 
 
-def test_order_is_chosen_by_held_out_error(noisy):
+def test_order_is_chosen_by_held_out_error_and_one_too_high_stays_stable(noisy):
     model, errors = choose_order(noisy[:4], noisy[4:], orders=(2, 4, 8))
     assert model.order == 4
     assert errors[2] > 10 and errors[4] == pytest.approx(1.0, rel=0.15)
-
-
-def test_a_model_of_too_high_an_order_stays_stable(noisy):
     response = frequency_response(noisy)
     assert refined(subspace(response, 12), response, iterations=3).radius < 1
 

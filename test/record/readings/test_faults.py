@@ -37,15 +37,12 @@ def test_a_good_record_makes_nobody_suspicious():
     assert suspicions(Record((Piece(v, y, 1000.0), rest))) == []
 
 
-def test_sensor_at_its_stop():
+def test_a_sensor_at_its_stop_is_told_and_a_step_after_a_rest_is_none():
     v, y = triangle()
     (said,) = suspicions(Record((Piece(v, np.clip(y, 0.5e-6, None), 1000.0),), 'clipped'))
     assert 'stop' in said
     assert '5e-07' in said
     assert 'NaN' in said
-
-
-def test_a_step_after_a_rest_is_no_stop():
     v = np.repeat(np.tile([4.0, 6.0], 10), 2000)
     y = np.roll(np.round(1e-6 * v / 24e-9) * 24e-9, 5)
     assert suspicions(Record((Piece(v, y, 10e3),))) == []
