@@ -10,38 +10,32 @@ from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult, StepDelay
 import pytest
 
+WRONG = {
+    'thresholds': (1, 401),
+    'solver': ('magic',),
+    'max_order': (0, 51),
+    'order': ((0, 1), (1, 51), (2,), (2.5, 2), 2, (2, 2, 2)),
+    'delay': (-1, 10_001),
+    'hold_out': (0.0, float('nan'), float('inf')),
+    'seed': (-1,),
+    'swarm_size': (1,),
+    'swarm_iterations': (0,),
+}
+
 
 @pytest.mark.parametrize(
-    ('wrong', 'says'),
+    ('name', 'value', 'says'),
     [
-        ({'thresholds': 1}, 'thresholds'),
-        ({'thresholds': 401}, 'thresholds'),
-        ({'thresholds': 3.5}, r'thresholds must be a whole number, got 3\.5'),
-        ({'thresholds': 'x'}, "thresholds must be a whole number, got 'x'"),
-        ({'seed': None}, 'seed must be a whole number, got None'),
-        ({'hold_out': '5'}, "hold_out must be a number, got '5'"),
-        ({'solver': 'magic'}, 'solver'),
-        ({'max_order': 0}, 'max_order'),
-        ({'max_order': 51}, 'max_order'),
-        ({'order': (0, 1)}, 'order'),
-        ({'order': (1, 51)}, 'order'),
-        ({'order': (2,)}, 'order'),
-        ({'order': (2.5, 2)}, 'order'),
-        ({'order': 2}, 'order'),
-        ({'order': (2, 2, 2)}, 'order'),
-        ({'delay': -1}, 'delay'),
-        ({'delay': 10_001}, 'delay'),
-        ({'hold_out': 0.0}, 'hold_out'),
-        ({'hold_out': float('nan')}, 'hold_out'),
-        ({'hold_out': float('inf')}, 'hold_out'),
-        ({'seed': -1}, 'seed'),
-        ({'swarm_size': 1}, 'swarm_size'),
-        ({'swarm_iterations': 0}, 'swarm_iterations'),
+        *((name, x, name) for name in WRONG for x in WRONG[name]),
+        ('thresholds', 3.5, r'thresholds must be a whole number, got 3\.5'),
+        ('thresholds', 'x', "thresholds must be a whole number, got 'x'"),
+        ('seed', None, 'seed must be a whole number, got None'),
+        ('hold_out', '5', "hold_out must be a number, got '5'"),
     ],
 )
-def test_what_cannot_be_followed_is_refused(wrong, says):
+def test_what_cannot_be_followed_is_refused(name, value, says):
     with pytest.raises(ConfigError, match=says):
-        Settings(**wrong)
+        Settings(**{name: value})
 
 
 def step(samples):

@@ -158,49 +158,30 @@ def test_a_misspelt_key_is_named_rather_than_missing(wrong, key):
 
 
 HUGE = 10**400
-WRONG = [
-    ('sample_rate', 'fast'),
-    ('sample_rate', True),
-    ('sample_rate', None),
-    ('sample_rate', [1]),
-    ('sample_rate', 0),
-    ('sample_rate', '.nan'),
-    ('sample_rate', HUGE),
-    ('input', [1]),
-    ('input.V', -1),
-    ('input.V', {}),
-    ('input.range', [0]),
-    ('input.range', '0..10'),
-    ('input.range', [10, 0]),
-    ('input.range', [0, 'ten']),
-    ('input.range', [0, HUGE]),
-    ('output.Y', 0),
-    ('output.Y', float('inf')),
-    ('delay.samples', 1.5),
-    ('delay.samples', -1),
-    ('delay.samples', float('nan')),
-    ('delay.samples', float('inf')),
-    ('delay.samples', 1e18),
-    ('delay.fraction', 1),
-    ('hysteresis.weights', [0.1]),
-    ('hysteresis.weights', {}),
-    ('hysteresis.weights', None),
-    ('hysteresis.p1', 'x'),
-    ('hysteresis.thresholds', [[0.1]]),
-    ('dynamics.a', [-1.1]),
-    ('dynamics.a', 'none'),
-    ('dynamics.b', []),
-    ('dynamics.b', [True]),
-    ('dynamics.b', [HUGE]),
-    ('effects', {'name': 'creep'}),
-    ('effects', ['creep']),
-    ('effects', [{'name': 'creep'}]),
-    ('effects', [{'name': 'magic', 'parameters': {}}]),
-    ('effects', [{'name': None, 'parameters': {}}]),
-    ('effects', [{'name': 'creep', 'parameters': {1: 2, 'gain': [1]}}]),
-    ('effects', [{'name': 'creep', 'parameters': {'gain': [HUGE], 'time_constant': [1]}}]),
-    ('effects', [{'name': 'creep', 'parameters': {'gain': [[1]], 'time_constant': [1]}}]),
-    ('identification', [1]),
+WRONG = {
+    'sample_rate': ('fast', True, None, [1], 0, '.nan', HUGE),
+    'input': ([1],),
+    'input.V': (-1, {}),
+    'input.range': ([0], '0..10', [10, 0], [0, 'ten'], [0, HUGE]),
+    'output.Y': (0, float('inf')),
+    'delay.samples': (1.5, -1, float('nan'), float('inf'), 1e18),
+    'delay.fraction': (1,),
+    'hysteresis.weights': ([0.1], {}, None),
+    'hysteresis.p1': ('x',),
+    'hysteresis.thresholds': ([[0.1]],),
+    'dynamics.a': ([-1.1], 'none'),
+    'dynamics.b': ([], [True], [HUGE]),
+    'effects': (
+        *({'name': 'creep'}, ['creep'], [{'name': 'creep'}]),
+        *([{'name': name, 'parameters': {}}] for name in ('magic', None)),
+        [{'name': 'creep', 'parameters': {1: 2, 'gain': [1]}}],
+        [{'name': 'creep', 'parameters': {'gain': [HUGE], 'time_constant': [1]}}],
+        [{'name': 'creep', 'parameters': {'gain': [[1]], 'time_constant': [1]}}],
+    ),
+    'identification': ([1],),
+}
+#: with what is said of them
+TOLD = [
     *(('schema_version', x, 'schema_version') for x in (0, -1, 1.5, 'one', None, True, [1])),
     *(('schema_version', x, 'update piezo_ident') for x in (SCHEMA_VERSION + 1, 99)),
     ('hysteresis.curves', [0.1] * 9, 'list of numbers'),
@@ -214,7 +195,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(('key', 'value', 'says'), [(*wrong, '')[:3] for wrong in WRONG])
+@pytest.mark.parametrize(
+    ('key', 'value', 'says'), [*((key, x, '') for key in WRONG for x in WRONG[key]), *TOLD]
+)
 def test_wrong_values_are_refused_in_one_line(key, value, says):
     d = data()
     *path, last = key.split('.')

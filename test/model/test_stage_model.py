@@ -63,20 +63,16 @@ def test_scaling_goes_both_ways():
 
 
 @pytest.mark.parametrize(
-    'wrong',
+    ('key', 'value'),
     [
-        {'V': 0.0},
-        {'V': -1.0},
-        {'Y': 0.0},
-        {'v0': float('nan')},
-        {'range': (1.0, 1.0)},
-        {'range': (2.0, 1.0)},
-        {'range': (0.0, float('inf'))},
+        *(('V', 0.0), ('V', -1.0), ('Y', 0.0), ('v0', float('nan'))),
+        *(('range', ends) for ends in ((1.0, 1.0), (2.0, 1.0), (0.0, float('inf')))),
     ],
 )
-def test_scaling_that_cannot_be_is_refused(wrong):
+def test_scaling_that_cannot_be_is_refused(key, value):
+    known = {'v0': 0.0, 'V': 10.0, 'y0': 0.0, 'Y': 1e-5, 'range': (0.0, 10.0)}
     with pytest.raises(ModelError, match='scaling'):
-        Scaling(**{'v0': 0.0, 'V': 10.0, 'y0': 0.0, 'Y': 1e-5, 'range': (0.0, 10.0), **wrong})
+        Scaling(**{**known, key: value})
 
 
 def test_unstable_dynamics_and_bad_rates_are_refused():

@@ -145,13 +145,8 @@ def test_paper_stage():
 @pytest.mark.parametrize(
     ('a', 'stable'),
     [
-        ([], True),
-        ([-0.999], True),
-        ([-1.0], False),
-        ([-2.0], False),
-        ([0.0, 1.0], False),
-        ([-2.0, 1.0], False),
-        ([0.5, -1.5], False),
+        *((a, True) for a in ([], [-0.999])),
+        *((a, False) for a in ([-1.0], [-2.0], [0.0, 1.0], [-2.0, 1.0], [0.5, -1.5])),
     ],
 )
 def test_a_pole_on_the_circle_or_beyond_is_not_stable(a, stable):
