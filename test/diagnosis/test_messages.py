@@ -71,12 +71,7 @@ def narrow_model():
 #: record, candidates, verdict, and whether the model changes
 CASES = {
     'nothing is missing': (played, 'saturation', 'none', False),
-    'one effect': (
-        lambda: played(saturation={'high': 0.9}),
-        'saturation,backlash',
-        'named',
-        True,
-    ),
+    'one effect': (lambda: played(saturation={'high': 0.9}), 'saturation,backlash', 'named', True),
     'one of several': (lambda: played(creep=CREEP), 'creep', 'class', True),
     'follows time alone': (
         lambda: played(lambda x, t: x * (1 + 0.01 * t), labelled=False),
@@ -84,12 +79,7 @@ CASES = {
         'class',
         True,
     ),
-    'a part': (
-        lambda: played(vibration(0.0012), creep=CREEP),
-        'creep',
-        'partly_explained',
-        True,
-    ),
+    'a part': (lambda: played(vibration(0.0012), creep=CREEP), 'creep', 'partly_explained', True),
     'another hysteresis': (lambda: played(bent), 'creep', 'refitted', True),
     'no candidate': (lambda: played(vibration(0.004)), 'saturation', 'unexplained', False),
     'another gain': (lambda: played(lambda x, t: 1.03 * x), 'creep', 'refitted', True),

@@ -35,13 +35,7 @@ def test_a_loop_of_little_coherence_is_an_answer():
 
 @pytest.mark.parametrize(
     'drift',
-    [
-        np.zeros(401),
-        T,
-        np.log(1.0 + 50.0 * T),
-        np.exp(-7.0 * T),
-        T**2 - T,
-    ],
+    [np.zeros(401), T, np.log(1.0 + 50.0 * T), np.exp(-7.0 * T), T**2 - T],
     ids=['none', 'line', 'logarithm', 'decay', 'square'],
 )
 def test_a_dead_channel_is_no_answer_and_a_clean_voltage_is_not_called_noise(drift):

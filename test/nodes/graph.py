@@ -52,15 +52,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-__all__ = [
-    'ENDS',
-    'Graph',
-    'Handle',
-    'alive',
-    'crowd',
-    'in_time',
-    'listens',
-]
+__all__ = ['ENDS', 'Graph', 'Handle', 'alive', 'crowd', 'in_time', 'listens']
 
 ROOT = Path(__file__).resolve().parents[2]
 PROFILE = Path(__file__).with_name('prompt_discovery.xml')

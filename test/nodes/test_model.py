@@ -566,12 +566,7 @@ def test_a_model_file_is_taken_at_start_and_later(lab, tmp_path):
     np.testing.assert_allclose(means, [p.mean() for p in np.split(y, 20)[:19]], rtol=1e-9)
 
 
-CREEP = [
-    {
-        'name': 'creep',
-        'parameters': {'gain': [0.02] * 3, 'time_constant': [0.1, 1.0, 10.0]},
-    }
-]
+CREEP = [{'name': 'creep', 'parameters': {'gain': [0.02] * 3, 'time_constant': [0.1, 1.0, 10.0]}}]
 
 
 def as_it_creeps(n):

@@ -67,11 +67,7 @@ def same(got: list[Samples], want: list[Samples]) -> bool:
 def lab():
     """Return a graph with players in namespaces of their own."""
     with Graph() as g:
-        g.start_all(
-            ('player', {}, 'b'),
-            ('player', {'wait_limit': 0.3}, 'c'),
-            ('player', {}, 'e'),
-        )
+        g.start_all(('player', {}, 'b'), ('player', {'wait_limit': 0.3}, 'c'), ('player', {}, 'e'))
         yield g
 
 

@@ -46,10 +46,7 @@ def whole(tmp_path_factory):
             ('model', {'window': 0.5, 'observe_gain': True, 'adapt': 'hysteresis'}),
             ('recorder', {'output': str(folder / 'bag')}),
             ('player', {'bag': str(folder / 'bag'), 'rate': 0.1}),
-            (
-                'feedforward',
-                {'silence': 0.2, 'ramp_slew': 200.0, 'window': 0.2, 'follow': 'gain'},
-            ),
+            ('feedforward', {'silence': 0.2, 'ramp_slew': 200.0, 'window': 0.2, 'follow': 'gain'}),
         )
         g.output, g.asked = folder, []
         # recorded here, for every test of this file may be run alone
