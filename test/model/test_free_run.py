@@ -77,14 +77,8 @@ def test_at_least_one_period_is_dropped_and_one_is_left():
 @pytest.mark.parametrize(
     ('label', 'frequency'),
     [
-        ('sine:50Hz', 50.0),
-        ('sine:0.5Hz', 0.5),
-        ('sine:50Hz-2', 50.0),
-        ('sine:1e2Hz', 100.0),
-        ('sine', None),
-        ('sine:0Hz', None),
-        ('sine:50Hzz', None),
-        ('multisine:50Hz', None),
+        *(('sine:50Hz', 50.0), ('sine:0.5Hz', 0.5), ('sine:50Hz-2', 50.0), ('sine:1e2Hz', 100.0)),
+        *((label, None) for label in ('sine', 'sine:0Hz', 'sine:50Hzz', 'multisine:50Hz')),
     ],
 )
 def test_frequency_of_a_label(label, frequency):

@@ -70,15 +70,11 @@ def test_times_of_samples_in_a_row(t):
     ('t', 'reason'),
     [
         (TICKS[:0], 'empty'),
-        (np.array([1e300]), 'not finite'),
-        (np.full(100, 1e300), 'not finite'),
+        *((np.where(TICKS == TICKS[50], x, TICKS), 'not finite') for x in (np.nan, np.inf)),
+        *((t, 'not finite') for t in (np.full(1, 1e300), np.full(100, 1e300))),
         (np.array([-1e308, 1e308]), 'not finite'),
-        (np.where(TICKS == TICKS[50], np.nan, TICKS), 'not finite'),
-        (np.where(TICKS == TICKS[50], np.inf, TICKS), 'not finite'),
         (np.where(TICKS == TICKS[50], 1e300, TICKS), 'in a row'),
-        (TICKS[::-1], 'in a row'),
-        (np.zeros(100), 'in a row'),
-        (np.delete(TICKS, 50), 'in a row'),
+        *((t, 'in a row') for t in (TICKS[::-1], np.zeros(100), np.delete(TICKS, 50))),
         (1e-9 * np.arange(100), 'in a row'),
     ],
 )
