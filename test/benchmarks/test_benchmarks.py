@@ -116,13 +116,10 @@ def test_turns_are_taken_in_order():
     assert turns['a'].over(turns['a']) == 1.0
 
 
-def test_ratio_of_two_works_is_the_median_over_pairs():
+def test_ratio_of_two_works_is_the_median_over_pairs_and_times_have_their_unit():
     one, other = Turn([2.0, 30.0, 4.0]), Turn([1.0, 10.0])
     assert one.over(other) == pytest.approx(2.5)
     assert one.median == 4.0
-
-
-def test_times_have_their_unit():
     texts = [seconds(t) for t in (2.345, 0.0123, 4.5e-6, 1.234e-8, 1234.4)]
     assert texts == ['2.35 s', '12.3 ms', '4.5 µs', '12.3 ns', '1234 s']
 

@@ -94,15 +94,12 @@ def test_a_motion_that_dips_below_rest_by_less_than_the_stage_errs_by_is_made():
             pi.invert(known, refused)
 
 
-def test_a_motion_beyond_a_limit_is_told_by_how_much_to_move_it():
+def test_a_motion_beyond_a_limit_is_told_by_how_much_to_move_it_and_a_jump_is_called_that():
     high = scan(30e-6, 50e-6)
     with pytest.raises(DataError, match=r'lower the motion by \d\S* um') as refused:
         pi.invert(PAPER, high)
     by = float(re.search(r'lower the motion by (\S+) um', str(refused.value))[1])
     assert not pi.invert(PAPER, high - 1e-6 * by).clipped.any()
-
-
-def test_a_jump_that_no_voltage_makes_is_called_that():
     wanted = np.where(np.arange(4000) < 2000, 20e-6, 60e-6)
     with pytest.raises(DataError, match=r'out of reach .* the motion jumps .*round'):
         pi.invert(with_mode(600.0), wanted)

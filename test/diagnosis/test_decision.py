@@ -131,12 +131,9 @@ def test_a_change_of_g_exceeds_what_g_missed_before(given, missed, names):
     assert taken(some) == names
 
 
-def test_a_branch_that_was_passed_once_names_nothing(given):
+def test_a_branch_that_was_passed_once_and_what_gains_as_much_on_surrogates_name_nothing(given):
     once = SimpleNamespace(**{**vars(given.rows), 'passes': 2.0})
     assert taken(replace(given, rows=once).and_these([found('creep', left=0.0)])) == ()
-
-
-def test_what_gains_as_much_on_surrogates_is_chance(given):
     assert taken(given.and_these([found('backlash', left=0.1 * WHOLE, chance=0.7 * WHOLE)])) == ()
     # a drift fits a shifted residual as well
     drift = found('thermal_drift', left=0.1 * WHOLE, chance=0.7 * WHOLE)

@@ -34,13 +34,10 @@ def tutorial():
     return module
 
 
-def test_the_notebook_is_the_page(tutorial):
+def test_the_notebook_is_the_page_and_the_data_are_small(tutorial):
     stored = nbformat.read(tutorial.NOTEBOOK, as_version=4)
     page = tutorial.notebook(tutorial.PAGE.read_text(encoding='utf-8'))
     assert stored.cells == page.cells, 'run python docs/refresh_tutorial.py'
-
-
-def test_the_data_are_small(tutorial):
     assert tutorial.DATA.stat().st_size < 300_000
     assert tutorial.SCANNER.stat().st_size < 200_000
 

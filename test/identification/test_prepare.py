@@ -27,7 +27,7 @@ def record(*pieces, name='mine'):
 RAMP = np.linspace(0, 10, 1001)
 
 
-def test_rate_with_the_most_travel_wins():
+def test_rate_with_the_most_travel_wins_and_rates_that_differ_by_rounding_are_one():
     slow, fast = piece(RAMP, rate=1000.0), piece(np.tile(RAMP, 3), rate=20_000.0)
     rate, left = common_rate([record(slow), record(fast)])
     assert rate == 20_000
@@ -36,9 +36,6 @@ def test_rate_with_the_most_travel_wins():
     assert common_rate([record(slow)]) == (1000.0, [])
     runs = runs_of([record(slow), record(fast)], rate, scaling_of([fast]))
     assert [run.piece.sample_rate for run in runs] == [20_000.0]
-
-
-def test_rates_that_differ_by_rounding_are_one():
     one, two = piece(RAMP, rate=20_000.0), piece(RAMP, rate=20_000.0 * (1 + 1e-9))
     rate, left = common_rate([record(one), record(two)])
     assert left == []
@@ -77,14 +74,11 @@ def run_of(v, *segments, rate=1000.0):
     return runs_of([record(made)], rate, scaling_of([made]))[0]
 
 
-def test_masks_are_those_of_the_kinds():
+def test_masks_are_those_of_the_kinds_and_the_end_of_the_noise_is_held_out():
     run = run_of(RAMP, ('step', 0, 100), ('noise:a', 200, 300), ('noise:b', 300, 350))
     assert_array_equal(np.flatnonzero(run.mask('noise')), np.arange(200, 350))
     assert run.mask('step', 'noise').sum() == 250
     assert not run.mask('triangle').any()
-
-
-def test_end_of_the_noise_is_held_out():
     run = run_of(RAMP, ('noise', 100, 600))
     first = 600 - int(END_HELD * 500)
     assert_array_equal(np.flatnonzero(run.held_out()), np.arange(first, 600))

@@ -235,15 +235,12 @@ def test_smooth_truth_gets_more_thresholds_and_less_error():
     assert error_of(chosen, fit, held) < 0.2 * error_of(even_thresholds(1.0, 10), fit, held)
 
 
-def test_few_thresholds_off_the_grid_are_found():
+def test_few_thresholds_off_the_grid_are_found_and_noise_alone_buys_none():
     fit, held = split(Hysteresis([0.137, 0.42, 0.71], [0.4, 0.3, 0.2], -0.3, 1.0), 1e-5)
     chosen = choose_thresholds([fit], [held], 1.0, UNIT, NONE)
     assert error_of(chosen, fit, held) < 3e-5
     for r in (0.137, 0.42, 0.71):
         assert np.abs(chosen - r).min() < 0.01
-
-
-def test_noise_alone_buys_no_threshold():
     fit, held = split(Hysteresis(even_thresholds(1.0, 10), np.full(9, 0.1), -0.3, 1.0), 0.01)
     assert choose_thresholds([fit], [held], 1.0, UNIT, NONE).size <= 9
 

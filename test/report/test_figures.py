@@ -67,16 +67,13 @@ def test_every_picture_has_finite_data_and_labelled_axes(identified, runs):
         assert any(np.isfinite(np.asarray(y, float)).any() for y in data), picture.name
 
 
-def test_overview_shows_measurement_and_model(runs):
+def test_overview_shows_measurement_and_model_and_sines_are_those_of_the_result(runs):
     y, y_hat = runs[1].piece.y, runs[1].y_hat
     lines = lines_of(overview_figure(runs[1]))
     shown = lines['measured'][:, 1]
     assert (shown.min(), shown.max()) == pytest.approx((1e6 * y.min(), 1e6 * y.max()))
     # the error is the last line that is called model
     assert np.abs(lines['model'][:, 1]).max() == pytest.approx(1e9 * np.abs(y - y_hat).max())
-
-
-def test_sines_are_those_of_the_result(runs):
     errors = sines_of(runs)
     lines = lines_of(sines_figure(errors))
     expected = [(e.frequency, e.percent) for e in errors]

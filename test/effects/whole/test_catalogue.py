@@ -310,14 +310,11 @@ def test_trials_are_valid_on_any_data(rate, low, span, fastest, duration, lines,
                 effect(rate, setting, H)
 
 
-def test_another_displacement_is_no_cause_of_this_one():
+def test_trials_need_what_an_effect_needs_and_another_displacement_is_no_cause():
     moving = {'v_b': (0.0, 1.0), 'y_b': (0.0, 1.0), 'heat': (0.0, 1.0)}
     view = View(FS, 0.0, 1.0, np.ones(5), 1.0, channels=moving)
     trials = find_effect('cross_coupling').trials(view)
     assert {trial.values['channel'] for trial in trials} == {'v_b', 'heat'}
-
-
-def test_trials_of_data_without_what_an_effect_needs_are_none():
     view = View(FS, 0.0, 0.0, np.zeros(5), 1.0)
     for name in ('backlash', 'cross_coupling', 'periodic_disturbance', 'slew_limit'):
         assert catalogue()[name].trials(view) == ()

@@ -37,7 +37,9 @@ def test_the_memory_of_a_first_rise_is_estimated(sign):
     assert any('had not come down to it' in warning for warning in run.warnings)
 
 
-def test_identification_takes_the_memory_of_a_first_rise_for_unknown():
+def test_one_hears_of_a_first_rise_and_identification_takes_its_memory_for_unknown():
+    (said,) = suspicions(record(slow_model(), came_up=True))
+    assert 'was not driven before' in said
     model = slow_model()
     [run] = runs_of([record(model, came_up=True)], SLOW, model.scaling)
     assert not run.known[:100].any() and run.known[-1]
@@ -45,19 +47,11 @@ def test_identification_takes_the_memory_of_a_first_rise_for_unknown():
     assert run.known.all()
 
 
-def test_one_hears_of_a_first_rise():
-    (said,) = suspicions(record(slow_model(), came_up=True))
-    assert 'was not driven before' in said
-
-
-def test_creep_and_drift_are_no_first_rise():
+def test_creep_drift_and_a_record_that_never_comes_back_are_no_first_rise():
     assert suspicions(record(slow_model(), came_up=False, drift=0.02)) == []
     for name in ('paper', 'effects'):
         played = pi.SimulatedStage.load(name).play(pi.Program.load('holds'))
         assert not any(rises_first(piece) for piece in played)
-
-
-def test_a_record_that_never_comes_back_tells_nothing():
     v = np.concatenate([np.zeros(500), np.linspace(0, 10, 1500)])
     assert not rises_first(Piece(v, 1e-6 * v, 1000.0))
     assert not rises_first(Piece(v[::-1].copy(), 1e-6 * v, 1000.0))
