@@ -5,7 +5,7 @@
 
 from dataclasses import replace
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from paper_stage import PAPER
@@ -36,6 +36,7 @@ def test_percent_of_stroke_and_fit_by_hand_and_without_a_stroke():
     assert fit_percent(still, still + 1) == float('-inf')
 
 
+@settings(deadline=None)
 @given(
     st.floats(1e-9, 1e3),
     st.floats(-1e-3, 1e-3),

@@ -169,6 +169,7 @@ def test_full_range_is_not_clipping():
     assert PAPER.play(VALIDATION, np.random.default_rng(1)).faults == ()
 
 
+@settings(deadline=None)
 @given(
     bits=st.integers(1, 24),
     low=st.floats(-10, 0),
