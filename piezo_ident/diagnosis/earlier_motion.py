@@ -17,11 +17,7 @@ from typing import Any
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
-from piezo_ident.diagnosis.equations import (
-    held_out_errors,
-    normal_equations,
-    with_columns,
-)
+from piezo_ident.diagnosis.equations import held_out_errors, normal_equations, with_columns
 from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, POLISH, POLISHING, tried
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import cost_of_decays, CREEP, State

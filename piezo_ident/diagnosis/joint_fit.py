@@ -19,7 +19,6 @@ from typing import ParamSpec
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError, ModelError
-from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.equations import (
     BaseColumns,
     FitStep,
@@ -64,6 +63,8 @@ POOR = 2
 LEAST_RATIO = 0.5
 #: finite difference of a weight of H, normalised
 WEIGHT_STEP = 1e-3
+#: most repetitions with fresh columns, and the smallest gain that justifies another one
+POLISHING, POLISH = 6, 0.02
 
 
 @dataclass(frozen=True)
@@ -347,23 +348,3 @@ def _derivatives(
         if change is not None:
             columns[j] = change / step
     return columns.T
-
-
-#: a fit ends after a step that gains less than this share of the mean square of the noise, or of
-#: the smallest effect if that is smaller
-OF_LEAST = 0.01
-#: size of a meaningless difference, rms in % of stroke: weights of H never describe a stage more
-#: exactly
-INDISTINCT = 0.01
-#: most repetitions with fresh columns, and the smallest gain that justifies another one
-POLISHING, POLISH = 6, 0.02
-
-
-def least_gain(rows: Rows, noise: float) -> float:
-    """Return the smallest useful gain of a step; gain and noise are mean squares."""
-    return OF_LEAST * min(noise, rows.square(SMALLEST_EFFECT))
-
-
-def good_enough(rows: Rows, noise: float) -> float:
-    """Return the mean square below which a residual cannot be separated from the noise."""
-    return noise + rows.square(INDISTINCT)

@@ -14,29 +14,27 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
+from operator import attrgetter
 from threading import Event
 from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import Cancelled
+from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.joint_fit import (
     fit_base,
     fit_jointly,
     Fitted,
-    good_enough,
-    least_gain,
     POLISHING,
     tried,
     Until,
 )
 from piezo_ident.diagnosis.next_experiment import look_alikes
-from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State
 from piezo_ident.diagnosis.trial_scores import (
-    best_trials,
     score_trials,
     Scored,
     shows,
@@ -61,9 +59,15 @@ STARTS, FIRST, FINAL = 2, 3, 2
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
-
+#: a fit ends after a step that gains less than this share of the mean square of the noise, or of
+#: the smallest effect if that is smaller
+OF_LEAST = 0.01
+#: size of a meaningless difference, rms in % of stroke: weights of H never describe a stage more
+#: exactly
+INDISTINCT = 0.01
 #: interval at which a caller may stop the search [s]
 ASKED = 0.1
+_error, _by_error = attrgetter('mean_square'), attrgetter('error')
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +79,8 @@ class Round:
     ----------
     before : Fitted
         The fit to which the candidates were added.
-    best : dict of str to Scored
-        The best trial of every candidate that could be tried.
+    gains : dict of str to float
+        Mean square that each possible candidate gains, in its best trial or in its joint fit.
     contenders : tuple of Fitted
         Candidates after the joint fit that show, ordered by error.
     chance : dict of str to float
@@ -88,7 +92,7 @@ class Round:
     """
 
     before: Fitted
-    best: dict[str, Scored]
+    gains: dict[str, float]
     contenders: tuple[Fitted, ...]
     chance: dict[str, float]
     visible: dict[str, float]
@@ -112,36 +116,33 @@ def search_round(
     A fit ends early if it cannot reach the mean square `goal`.
     """
     surrogates, n = _surrogates(before.e, rng), columns.rows.n
-    trials: dict[str, list[Scored]] = {}
-    chance: dict[str, float] = {}
-    visible: dict[str, float] = {}
-    for scored in score_trials(
-        columns, before, effects, surrogates, lambda share: tick(0.5 * share)
-    ):
-        name = scored.effect.name
-        visible[name] = max(visible.get(name, 0.0), scored.visible)
-        if scored.is_possible:
-            chance[name] = max(chance.get(name, 0.0), scored.chance / n)
-            trials.setdefault(name, []).append(scored)
-    for scores in trials.values():
-        scores.sort(key=lambda s: s.error)
+    whole, half = float(before.errors.sum()), lambda share: tick(0.5 * share)
+    every: dict[str, list[Scored]] = {}
+    for scored in score_trials(columns, before, effects, surrogates, half):
+        every.setdefault(scored.effect.name, []).append(scored)
+    possible = {name: [s for s in own if s.error < np.inf] for name, own in every.items()}
+    trials = {name: sorted(own, key=_by_error) for name, own in possible.items() if own}
     # the law with the best small step may not be the law with the best fit
     starts = {
         scores[0].effect: [
             before.state.with_effect(started(columns.rows, s)) for s in scores[:STARTS]
         ]
-        for scores in _promising(list(trials.values()), before, noise)
+        for scores in _promising(list(trials.values()), whole, noise * n)
     }
     _add_plain_starts(columns, before, starts)
     fits = _JointFits(columns.simulator, before, noise, goal, tick)
     contenders = fits.to_the_end(fits.begun(starts))
     tick(1.0)
+    gains = {name: (whole - scores[0].error) / n for name, scores in trials.items()}
+    for c in contenders:
+        gain = before.mean_square - c.mean_square
+        gains[c.name] = max(gains.get(c.name, gain), gain)
     return Round(
         before=before,
-        best={name: scores[0] for name, scores in trials.items()},
+        gains=gains,
         contenders=tuple(contenders),
-        chance=chance,
-        visible=visible,
+        chance={name: max(s.chance for s in own) / n for name, own in trials.items()},
+        visible={name: max(s.visible for s in own) for name, own in every.items()},
         warnings=tuple(fits.warnings),
     )
 
@@ -156,11 +157,10 @@ def _surrogates(e: Array, rng: np.random.Generator) -> Array:
     return np.stack(shifted[:SURROGATES], axis=1)
 
 
-def _promising(trials: Sequence[list[Scored]], before: Fitted, noise: float) -> list[list[Scored]]:
+def _promising(trials: Sequence[list[Scored]], whole: float, noise: float) -> list[list[Scored]]:
     """Select the effects that are fitted, from the scores of each effect, the best first."""
-    total = float(before.errors.sum())
-    least = WORTH_FIT * max(total - noise * before.e.size, 1e-300)
-    promising = [scores for scores in trials if total - scores[0].error > least]
+    least = WORTH_FIT * max(whole - noise, 1e-300)
+    promising = [scores for scores in trials if whole - scores[0].error > least]
     promising.sort(key=lambda scores: scores[0].error)
     chosen = promising[:JOINT_FITS]
     if not chosen:
@@ -188,10 +188,11 @@ def _add_plain_starts(
     until = Until(enough=WORTH_FIT * before.mean_square)
     plain = fit_jointly(simulator, *fit_base(simulator, before.state, plays), until=until)
     state = plain.state.with_coefficients(law, law.coefficients(plain.state.hysteresis))
-    best = best_trials(columns, plain, list(starts))
+    scores = score_trials(columns, plain, list(starts), np.zeros((columns.rows.n, 0)))
+    possible = sorted((s for s in scores if s.error < np.inf), key=_by_error)
     most = PLAIN_START * float(before.errors.sum())
     for effect, states in starts.items():
-        one = best.get(effect.name)
+        one = next((s for s in possible if s.effect is effect), None)
         if one is not None and (one.error < most or not one.trial.moves):
             states.append(state.with_effect(started(simulator.rows, one)))
 
@@ -214,9 +215,9 @@ class _JointFits:
         self, simulator: Simulator, before: Fitted, noise: float, worth: float, tick: Tick
     ) -> None:
         self._simulator, self._before, self._worth, self._tick = simulator, before, worth, tick
-        self._enough = least_gain(simulator.rows, noise)
+        self._enough = OF_LEAST * min(noise, simulator.rows.square(SMALLEST_EFFECT))
         #: mean square below which a residual cannot be separated from the noise
-        self._done = good_enough(simulator.rows, noise)
+        self._done = noise + simulator.rows.square(INDISTINCT)
         self._shows = cache(lambda fitted: shows(simulator, fitted, noise))
         self._share = 0.5
         #: candidates whose fits failed
@@ -227,7 +228,8 @@ class _JointFits:
 
     def begun(self, starts: Mapping[type[Effect], Sequence[State]]) -> list[_Begun]:
         """Fit all starts of each effect for a few iterations; the best effect comes first."""
-        whole = least = self._before.mean_square
+        whole, base = self._before.mean_square, self._before.base
+        least = whole
         found = list[_Begun]()
         for i, (effect, states) in enumerate(starts.items()):
             self._share = 0.5 + 0.5 * i / len(starts)
@@ -237,7 +239,13 @@ class _JointFits:
             goal = min(self._worth, whole - WORTH_END * (whole - least))
             if least < self._done:
                 goal = min(goal, FORM_RATIO * least + self._done)
-            begin = partial(self._begin, Until(FIRST, goal=goal))
+            until = Until(FIRST, goal=goal)
+
+            def begin(
+                own: Simulator, state: State, tick: Callable[[], None], until: Until = until
+            ) -> Fitted:
+                return fit_jointly(own, state, base, until=until, tick=tick)
+
             fits = [one for one in fit_starts(self._simulator, states, begin, self._alive) if one]
             least = min([least, *map(_error, fits)])
             if fits:
@@ -245,11 +253,6 @@ class _JointFits:
             else:
                 self.warnings.append(f'{effect.name} was not judged: its fits fail on these data')
         return sorted(found, key=lambda one: _error(one.fitted))
-
-    def _begin(
-        self, until: Until, own: Simulator, state: State, tick: Callable[[], None]
-    ) -> Fitted:
-        return fit_jointly(own, state, self._before.base, until=until, tick=tick)
 
     def to_the_end(self, begun: Sequence[_Begun]) -> list[Fitted]:
         """Fit the best candidates to the end; return the candidates that show, the best first."""
@@ -290,10 +293,6 @@ class _JointFits:
             if _error(fitted) > (1.0 - WORTH_FIT) * before or _error(fitted) < self._done:
                 break
         return fitted
-
-
-def _error(fitted: Fitted) -> float:
-    return fitted.mean_square
 
 
 def fit_starts(
@@ -341,13 +340,3 @@ def fit_starts(
         raise error
     shares = [future.result() for future in futures]
     return [shares[i % len(copies)][i // len(copies)] for i in range(len(states))]
-
-
-def gains_of(rows: Rows, this: Round) -> dict[str, float]:
-    """Compute the mean square that each candidate gains, in its trial or in its joint fit."""
-    total = float(this.before.errors.sum())
-    gains = {name: (total - s.error) / rows.n for name, s in this.best.items()}
-    for c in this.contenders:
-        gain = this.before.mean_square - c.mean_square
-        gains[c.name] = max(gains.get(c.name, gain), gain)
-    return gains

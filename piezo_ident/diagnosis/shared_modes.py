@@ -36,12 +36,7 @@ from piezo_ident.diagnosis.results import Diagnosis, Errors, FoundEffect, Unexpl
 from piezo_ident.fitting.modes.frequency_response import likeness
 from piezo_ident.fitting.modes.linear_fit import choose_order
 from piezo_ident.fitting.modes.loop_fit import loop_fit
-from piezo_ident.fitting.modes.periods import (
-    groups,
-    percent_of,
-    PeriodicRecord,
-    periods_of,
-)
+from piezo_ident.fitting.modes.periods import groups, percent_of, PeriodicRecord, periods_of
 from piezo_ident.fitting.modes.signals import with_input_plays, with_loop_plays, with_softening
 from piezo_ident.identification.prepare import same_rate
 from piezo_ident.identification.settings import Progress

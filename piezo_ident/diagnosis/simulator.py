@@ -34,13 +34,7 @@ from piezo_ident.diagnosis.run_chain import (
     run_abreast,
     RunChain,
 )
-from piezo_ident.diagnosis.state import (
-    Added,
-    BEYOND,
-    retuned,
-    retuning_factor,
-    State,
-)
+from piezo_ident.diagnosis.state import Added, BEYOND, retuned, retuning_factor, State
 from piezo_ident.effects import Effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block

@@ -63,13 +63,12 @@ class Scored:
     coefficients : ndarray, shape (c,)
         Steps of the amplitudes, from the least-squares fit.
     error : float
-        Sum of squares of all blocks, held out in spread sets.
+        Sum of squares of all blocks, held out in spread sets.  Infinite for an effect that is
+        either on or off if its fitted amplitude is not about one.
     chance : float
         Largest decrease of the sum of squares of a surrogate.
     visible : float
         Share of its columns that the rest of the model cannot imitate.
-    is_possible : bool
-        Whether an effect that is either on or off is fitted with an amplitude of about one.
     """
 
     effect: type[Effect]
@@ -78,7 +77,6 @@ class Scored:
     error: float
     chance: float
     visible: float
-    is_possible: bool = True
 
 
 class TrialColumns:
@@ -159,25 +157,11 @@ def score_trials(
             theta = solve(both.A.sum(axis=0), both.b[:, :, 0].sum(axis=0), wide)[p:]
             visible = _visible(both, p, wide)
             if not trial.moves and not ON_AMPLITUDE[0] <= theta[0] <= ON_AMPLITUDE[1]:
-                whole_error = float(known.s[:, 0].sum())
-                yield Scored(effect, trial, theta, whole_error, 0.0, visible, False)
+                yield Scored(effect, trial, theta, np.inf, 0.0, visible)
                 continue
             errors = held_out_errors(both, rows.fold, wide)
             chance = float((alone - errors.sum(axis=0))[1:].max(initial=0.0))
             yield Scored(effect, trial, theta, float(errors[:, 0].sum()), chance, visible)
-
-
-def best_trials(
-    columns: TrialColumns, fitted: Fitted, effects: Sequence[type[Effect]]
-) -> dict[str, Scored]:
-    """Find the best possible trial of every effect on the residual of a fit."""
-    best: dict[str, Scored] = {}
-    none = np.zeros((columns.rows.n, 0))
-    for scored in score_trials(columns, fitted, effects, none):
-        name = scored.effect.name
-        if scored.is_possible and (name not in best or scored.error < best[name].error):
-            best[name] = scored
-    return best
 
 
 def _visible(equations: NormalEquations, p: int, prior: Array) -> float:
@@ -206,14 +190,13 @@ def started(rows: Rows, scored: Scored) -> Added:
 
 def _view_of(simulator: Simulator, lines: Sequence[float]) -> View:
     rows, model = simulator.rows, simulator.model
-    speeds = []
+    # differences over a row, so that converter steps do not count as speed
+    steps = [np.abs(np.diff(block_means(run.u, rows.m))) for run in rows.runs]
+    speed = np.concatenate(steps) * model.sample_rate / rows.m
     channels: dict[str, list[Array]] = {}
     for run in rows.runs:
-        # differences over a row, so that converter steps do not count as speed
-        speeds.append(np.abs(np.diff(block_means(run.u, rows.m))) * model.sample_rate / rows.m)
         for name, x in run.piece.channels.items():
             channels.setdefault(name, []).append(x)
-    speed = np.concatenate(speeds)
     moving = speed[speed > 1e-3 * speed.max(initial=0.0)]
     quantiles = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99, 0.999])
     # all records with the channel together, as the axis may rest in one of them

@@ -16,13 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from piezo_ident.diagnosis.criteria import (
-    CLASS_SIZE,
-    PASSES,
-    SMALLEST_EFFECT,
-    SWALLOWED,
-    TAKES,
-)
+from piezo_ident.diagnosis.criteria import CLASS_SIZE, PASSES, SMALLEST_EFFECT, SWALLOWED, TAKES
 from piezo_ident.diagnosis.decision import Candidates, change_g, Decision, FittedSet
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes, separating_experiment
@@ -38,7 +32,7 @@ from piezo_ident.diagnosis.results import (
     UNNAMED,
     Untestable,
 )
-from piezo_ident.diagnosis.search import gains_of, Round
+from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import catalogue, find_effect
 
 
@@ -200,7 +194,7 @@ def _shares(candidates: Candidates, rounds: Sequence[Round]) -> dict[str, float]
     for one in rounds:
         if one.before.state.effects:
             continue
-        for name, gain in gains_of(candidates.rows, one).items():
+        for name, gain in one.gains.items():
             level = candidates.without((name,))
             rest = max(one.before.mean_square - gain - candidates.noise, 0.0)
             share = 1.0 - rest / candidates.left(level)
