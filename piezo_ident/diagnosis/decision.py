@@ -55,13 +55,16 @@ class FittedSet:
     A set of effects beside one treatment of H and G, fitted.
 
     The effects are sorted, without the effects that have tests of their own.  The way is the
-    treatment of H: 'given', 'plays' or 'wide'.  `found_in` is the search that found the candidate.
+    treatment of H: 'given', 'plays' or 'wide'; for the refined model also 'drawn' (wide, towards
+    the given H) or 'gain' (the given H times `gain`).  `found_in` is the search that found the
+    candidate.
     """
 
     effects: tuple[str, ...]
     way: str
     fitted: Fitted
     found_in: Round | None = None
+    gain: float = 1.0
 
     @property
     def size(self) -> int:
@@ -99,10 +102,7 @@ class Candidates:
 
     def left(self, candidate: FittedSet) -> float:
         """Compute the mean square error of a candidate less the noise."""
-        return self.left_by(candidate.fitted)
-
-    def left_by(self, fitted: Fitted) -> float:
-        """Compute the mean square error of a fit less the noise."""
+        fitted = candidate.fitted
         error = np.sqrt(fitted.errors.sum() * fitted.transfer.sum()) / self.rows.n
         return self.beyond_noise(float(error))
 

@@ -23,7 +23,7 @@ import numpy as np
 from piezo_ident.common.errors import expect, IdentificationError
 from piezo_ident.diagnosis.base_residual import base_residual, BaseResidual, prepared
 from piezo_ident.diagnosis.candidates import CandidateSearch
-from piezo_ident.diagnosis.decision import Candidates, decide
+from piezo_ident.diagnosis.decision import Candidates, decide, FittedSet
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.messages import (
     left_over,
@@ -33,7 +33,7 @@ from piezo_ident.diagnosis.messages import (
     warnings_of,
 )
 from piezo_ident.diagnosis.refined_model import found_effects, refine, Refined
-from piezo_ident.diagnosis.refits import law_of, walk, WalkStep, with_numerator
+from piezo_ident.diagnosis.refits import law_of, walk, with_numerator
 from piezo_ident.diagnosis.results import Diagnosis, DiagnosisSettings, Errors, Residual
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.diagnosis.simulator import Simulator
@@ -180,7 +180,7 @@ def _result(
     rounds: Sequence[Round],
     candidates: Candidates,
     findings: Findings,
-    last: WalkStep,
+    last: FittedSet,
     settings: DiagnosisSettings,
 ) -> Diagnosis:
     """Report the findings, without a sentence."""

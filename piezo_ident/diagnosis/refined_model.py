@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.diagnosis.criteria import MOVED_ZERO
+from piezo_ident.diagnosis.decision import FittedSet
 from piezo_ident.diagnosis.equations import normal_equations, summed
 from piezo_ident.diagnosis.joint_fit import Fitted
-from piezo_ident.diagnosis.refits import WalkStep
 from piezo_ident.diagnosis.results import Errors, FORMULA, FoundEffect, FoundParameter
 from piezo_ident.diagnosis.rows import centred, means, Rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -49,7 +49,7 @@ class Refined:
 def refine(
     simulator: Simulator,
     given: State,
-    last: WalkStep,
+    last: FittedSet,
     findings: Findings,
     errors: tuple[Errors, Errors],
 ) -> Refined:

@@ -12,7 +12,7 @@ wider H must remove most of the error on whole kinds of motion.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 import itertools
 
@@ -42,19 +42,6 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
 EARLIER, LEAST_TAPS = 3, 4
 #: laws of H wider than plays: the loops of the first are not congruent, the second also has lags
 WIDE: tuple[LawName, ...] = ('preisach', 'duhem')
-
-
-@dataclass(frozen=True, eq=False)
-class WalkStep:
-    """
-    One H of the walk: 'given', 'gain', 'plays', 'drawn' (wide, towards the given H) or 'wide'.
-
-    `gain` is relative to the given H, if only the gain has changed.
-    """
-
-    way: str
-    fitted: Fitted
-    gain: float = 1.0
 
 
 def refits(simulator: Simulator, given: State) -> tuple[Fitted, Fitted]:
@@ -91,7 +78,7 @@ def walk(
     candidates: Candidates,
     best: FittedSet | None,
     tick: Callable[[], None],
-) -> WalkStep:
+) -> FittedSet:
     """Choose the H of the refined model, beside the effects of the best candidate."""
 
     def goal() -> float:
@@ -129,10 +116,12 @@ def _steps(
     best: FittedSet | None,
     tick: Callable[[], None],
     goal: Callable[[], float],
-) -> Iterator[WalkStep]:
+) -> Iterator[FittedSet]:
     """Yield one H after the other; `goal` as in `Until`.  A fit that runs away ends the walk."""
+    names = () if best is None else best.effects
+    step = partial(FittedSet, names)
     # the best candidate of each treatment comes last, so it stays in the dictionary
-    own = candidates.of(() if best is None else best.effects)[::-1]
+    own = candidates.of(names)[::-1]
     known = {c.way: c.fitted for c in own if not c.retunes}
     retuned = {c.way: c.fitted for c in own if c.retunes}
     first = candidates.as_given.fitted
@@ -141,15 +130,15 @@ def _steps(
         beside = known.get('given') or tried(fit_jointly, simulator, state)
         if beside is None:
             # the fit diverges beside the given H, so the H of the candidate stays
-            yield WalkStep(best.way, best.fitted)
+            yield best
             return
         first = beside
-    yield WalkStep('given', first)
+    yield step('given', first)
     plays = known.get('plays') or tried(refit_of, simulator, first.state, 'plays', goal())
     if plays is None:
         return
-    yield WalkStep('plays', plays)
-    yield from (WalkStep(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
+    yield step('plays', plays)
+    yield from (step(way, retuned[way]) for way in ('given', 'plays') if way in retuned)
     of_law: dict[LawName, Fitted | None] = {}
     if 'wide' in known:
         of_law[law_of(known['wide'])] = known['wide']
@@ -168,10 +157,10 @@ def _steps(
         if drawn is None:
             return
         if drawn is not wide:
-            yield WalkStep('drawn', drawn)
+            yield step('drawn', drawn)
         laws = WIDE[:1]
     wides = [wide for name in laws if (wide := wide_of(name, goal())) is not None]
-    yield from (WalkStep('wide', wide) for wide in wides)
+    yield from (step('wide', wide) for wide in wides)
     wide = min(wides, key=partial(_left, candidates), default=None)
     # an effect that changes G leaves nothing for a retuning of G
     if wide and simulator.is_fast and not change_g([added.name for added in wide.state.effects]):
@@ -179,10 +168,10 @@ def _steps(
         if last is None or law_of(last) != law_of(wide):
             last = tried(with_g, simulator, wide)
         if last is not None:
-            yield WalkStep('wide', last)
+            yield step('wide', last)
 
 
-def with_numerator(simulator: Simulator, step: WalkStep) -> WalkStep:
+def with_numerator(simulator: Simulator, step: FittedSet) -> FittedSet:
     """
     Fit the numerator of G again, in turn with all else, beside an effect that moves a mode of G.
 
@@ -235,7 +224,7 @@ def law_of(fitted: Fitted) -> LawName:
     return 'any' if fitted.state.law is None else fitted.state.law.name
 
 
-def _other_gain(simulator: Simulator, fitted: Fitted) -> WalkStep:
+def _other_gain(simulator: Simulator, fitted: Fitted) -> FittedSet:
     """Fit another gain of an otherwise unchanged H."""
     rows, state = simulator.rows, fitted.state
     x = simulator.bare(state)
@@ -252,7 +241,7 @@ def _other_gain(simulator: Simulator, fitted: Fitted) -> WalkStep:
     moved = replace(moved, offsets=moved.offsets + shifts)
     own, kinds = (held_out_errors(equations, x, none)[:, 0] for x in (rows.fold, rows.group))
     step = Fitted(moved, base, e, np.empty((rows.n, 0)), free, (), none, own, kinds)
-    return WalkStep('gain', step, gain)
+    return FittedSet((), 'gain', step, gain=gain)
 
 
 #: number of samples of a sweep over the range

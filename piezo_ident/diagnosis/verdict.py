@@ -20,7 +20,6 @@ from piezo_ident.diagnosis.criteria import CLASS_SIZE, PASSES, SMALLEST_EFFECT, 
 from piezo_ident.diagnosis.decision import Candidates, change_g, Decision, FittedSet
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.next_experiment import look_alikes, separating_experiment
-from piezo_ident.diagnosis.refits import WalkStep
 from piezo_ident.diagnosis.results import (
     Candidate,
     Class,
@@ -78,7 +77,7 @@ class Findings:
 def judge(
     candidates: Candidates,
     decision: Decision,
-    last: WalkStep,
+    last: FittedSet,
     shown: tuple[str, ...],
     before: float,
     untried: Collection[str],
@@ -90,7 +89,7 @@ def judge(
     the best H is `before`.  The effects `untried` were not among the candidates.
     """
     rows, best = candidates.rows, decision.best
-    rest, whole = candidates.left_by(last.fitted), decision.whole
+    rest, whole = candidates.left(last), decision.whole
     if best is not None:
         rest = min(rest, candidates.left(best))
     gains = list[float]()

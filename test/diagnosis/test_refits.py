@@ -10,10 +10,11 @@ from diagnosis_examples import measured, played, refined_model
 import numpy as np
 from piezo_ident.common.errors import Cancelled, ModelError
 from piezo_ident.diagnosis import refits as refits_module
+from piezo_ident.diagnosis.decision import FittedSet
 from piezo_ident.diagnosis.diagnose import diagnose
 from piezo_ident.diagnosis.equations import held_out_residual, solve
 from piezo_ident.diagnosis.refined_model import _at_given_gain, _model
-from piezo_ident.diagnosis.refits import loops, refits, toward_given, WalkStep, with_numerator
+from piezo_ident.diagnosis.refits import loops, refits, toward_given, with_numerator
 from piezo_ident.diagnosis.results import DiagnosisSettings
 from piezo_ident.diagnosis.rows import centred, make_rows
 from piezo_ident.diagnosis.simulator import Simulator
@@ -150,9 +151,8 @@ def test_a_failed_fit_of_the_numerator_keeps_the_step(monkeypatch):
 
     monkeypatch.setattr(refits_module, '_with_other_numerator', fails)
     spring = Added('loop_hysteresis', ({'frequency': 300.0, 'damping': 0.03},))
-    step = WalkStep(
-        'plays', SimpleNamespace(state=SimpleNamespace(effects=(CREEP, spring)), mean_square=1.0)
-    )
+    fitted = SimpleNamespace(state=SimpleNamespace(effects=(CREEP, spring)), mean_square=1.0)
+    step = FittedSet((), 'plays', fitted)
     model = slow_model()
     assert with_numerator(SimpleNamespace(model=model), step) is step
     # G as given, and the mode of the spring alone
