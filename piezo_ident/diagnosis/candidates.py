@@ -13,7 +13,7 @@ tried beside the H as given, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, tried
 from piezo_ident.diagnosis.refits import law_of, refit_of, with_g
 from piezo_ident.diagnosis.search import Round, search_round
 from piezo_ident.diagnosis.simulator import Simulator
-from piezo_ident.diagnosis.trial_scores import TrialColumns
+from piezo_ident.diagnosis.trial_scores import Tick, TrialColumns
 from piezo_ident.effects import Effect, find_effect
 
 #: a fit goes on only while it may reach this share of the error of the best smaller set
@@ -34,8 +34,6 @@ PROMISING = 0.9
 EXTENDED = 2, 1
 #: number of sets of each size that are tried with all treatments of H and G
 IN_ALL_WAYS = 3
-
-Tick = Callable[[float], None]
 
 
 class CandidateSearch:
@@ -83,8 +81,13 @@ class CandidateSearch:
         candidates = self._ways(wide)
         least = min(map(candidates.left, candidates.all))
         path = [effect for effect in self._effects if effect.rate_independent]
-        best = _best_h(candidates)
-        for base in _worth_searching(candidates):
+        best = min((c for c in candidates.all if not c.retunes), key=candidates.left)
+        retuned = min((c for c in candidates.all if c.retunes), key=candidates.left, default=None)
+        bases = list(dict.fromkeys((candidates.as_given, best)))
+        # a retuned G must err clearly less than the best H with an unchanged G
+        if retuned and ALIKE * candidates.left(retuned) <= candidates.left(best):
+            bases.append(retuned)
+        for base in bases:
             some, goal = self._effects, PROMISING * least
             if base is not best and not base.retunes:
                 # the effect must lower the error nearly as much as a refit of H
@@ -204,16 +207,3 @@ class CandidateSearch:
             tick,
             goal=self._residual.noise + goal,
         )
-
-
-def _best_h(candidates: Candidates) -> FittedSet:
-    """Return the candidate with the H that leaves the smallest error with an unchanged G."""
-    return min((c for c in candidates.all if not c.retunes), key=candidates.left)
-
-
-def _worth_searching(candidates: Candidates) -> list[FittedSet]:
-    """List starts of a search: the given H, the best H, and a retuned G that errs clearly less."""
-    best = _best_h(candidates)
-    retuned = sorted((c for c in candidates.all if c.retunes), key=candidates.left)
-    more = [c for c in retuned if ALIKE * candidates.left(c) <= candidates.left(best)]
-    return [*dict.fromkeys((candidates.as_given, best)), *more[:1]]

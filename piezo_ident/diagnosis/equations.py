@@ -16,6 +16,7 @@ Appl. Math. 11(2), 1963, pp. 431-441, doi:10.1137/0111030.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 import itertools
@@ -121,6 +122,18 @@ def summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]
     return (A, b) if pull is None else (A + pull.A, b + pull.b[:, None])
 
 
+def _held_out(
+    equations: NormalEquations, sets: Integers, prior: Array, pull: Pull | None
+) -> Iterator[tuple[Mask, Array]]:
+    """Yield each set of blocks, and the coefficients that follow from the other sets."""
+    A, b = summed(equations, pull)
+    for one in np.unique(sets):
+        out = sets == one
+        if not out.all():
+            A_out, b_out = equations.A[out].sum(axis=0), equations.b[out].sum(axis=0)
+            yield out, solve(A - A_out, b - b_out, prior)
+
+
 def held_out_errors(
     equations: NormalEquations, sets: Integers, prior: Array, pull: Pull | None = None
 ) -> Array:
@@ -129,14 +142,9 @@ def held_out_errors(
 
     Blocks with the same number in `sets`, shape (blocks,), are left out together.
     """
-    A, b = summed(equations, pull)
     errors = equations.s.copy()
-    for one in np.unique(sets):
-        out = sets == one
-        if not out.all():
-            A_out, b_out = equations.A[out], equations.b[out]
-            theta = solve(A - A_out.sum(axis=0), b - b_out.sum(axis=0), prior)
-            errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
+    for out, theta in _held_out(equations, sets, prior, pull):
+        errors[out] += np.sum(theta * (equations.A[out] @ theta - 2.0 * equations.b[out]), axis=1)
     return np.maximum(errors, 0.0)
 
 
@@ -149,14 +157,8 @@ def held_out_residual(
     M holds the derivatives of the prediction, and e is the residual of the fit to all rows.  Near
     the optimum one Gauss-Newton step gives the parameters of a fit without a set of blocks.
     """
-    equations = normal_equations(rows, M, e[:, None])
-    A, b = summed(equations, pull)
     left = e.copy()
-    for one in np.unique(sets):
-        out = sets == one
-        if out.all():
-            continue
-        theta = solve(A - equations.A[out].sum(axis=0), b - equations.b[out].sum(axis=0), prior)
+    for out, theta in _held_out(normal_equations(rows, M, e[:, None]), sets, prior, pull):
         here = out[rows.block]
         left[here] -= (M @ theta[:, 0])[here]
     return left

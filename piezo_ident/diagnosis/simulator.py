@@ -34,7 +34,7 @@ from piezo_ident.diagnosis.run_chain import (
     run_abreast,
     RunChain,
 )
-from piezo_ident.diagnosis.state import Added, BEYOND, retuned, retuning_factor, State
+from piezo_ident.diagnosis.state import BEYOND, retuned, retuning_factor, State
 from piezo_ident.effects import Effect
 from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.operators.chain import Block
@@ -122,11 +122,7 @@ class Simulator:
             self._of_law = key, self._of_columns(wide.size, partial(self._behind_G, wide))
         whole = self._of_law[1]
         places = range(law.size) if law.name == wide.name else law.within(wide)
-        found = np.empty((law.size + more.shape[0], self.rows.n))
-        for column, place in zip(found, places, strict=False):
-            column[:] = whole[place]
-        found[law.size :] = more
-        return found
+        return np.stack([*(whole[place] for place in places), *more])
 
     def _behind_G(self, law: HysteresisLaw, i: int, places: range) -> Iterator[Array]:
         """Yield the rows of some columns of a law in a run."""
@@ -225,11 +221,6 @@ class Simulator:
             outputs = self._of_runs(lambda i: chains[i].output(keep=True))
             self._kept = _Kept(state, tuple(chains), self._predicted(state, outputs))
         return self._kept.prediction
-
-    def added(self, effects: Sequence[Added]) -> list[Array | None]:
-        """Compute the change of the rows of the remembered state for each added effect."""
-        state = self._known().state
-        return self.varied([(state.with_effect(added), added.effect, None) for added in effects])
 
     def varied(
         self, changes: Sequence[tuple[State, type[Effect] | None, int | None]]

@@ -128,11 +128,6 @@ class State:
         theta = np.maximum(coefficients, law.lower)
         return replace(self, hysteresis=law.hysteresis(theta), law=law, coefficients=theta)
 
-    def without(self, i: int) -> State:
-        """Return the state without an effect; earlier creep leaves with creep."""
-        rest = replace(self, effects=self.effects[:i] + self.effects[i + 1 :])
-        return rest.from_rest() if self.effects[i].name == CREEP else rest
-
     def from_rest(self) -> State:
         """Return the state without creep from earlier motion."""
         return replace(self, fading=(), earlier=np.empty(0))

@@ -122,8 +122,9 @@ class TrialColumns:
             settings = trial.settings()
             keys = [tuple(np.asarray(x).tobytes() for x in one.values()) for one in settings]
             new = {k: one for k, one in zip(keys, settings, strict=True) if k not in known}
-            added = [Added(effect.name, (one,) * len(rows.names)) for one in new.values()]
-            for key, column in zip(new, self.simulator.added(added), strict=True):
+            added = (Added(effect.name, (one,) * len(rows.names)) for one in new.values())
+            changes = [(self._state.with_effect(one), effect, None) for one in added]
+            for key, column in zip(new, self.simulator.varied(changes), strict=True):
                 known[key] = None
                 if column is not None and np.all(np.isfinite(column)):
                     known[key] = len(found)

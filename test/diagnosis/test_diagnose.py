@@ -758,7 +758,8 @@ def test_processors_that_share_a_run_give_the_columns_of_one(monkeypatch, name):
 def test_states_run_side_by_side_as_they_do_alone():
     model, record, _ = measured(None, 0.0, 1)
     simulator = Simulator(model, make_rows(model, [record]))
-    simulator.remember(State(model.hysteresis, np.zeros(1)))
+    state = State(model.hysteresis, np.zeros(1))
+    simulator.remember(state)
     each = [
         Added(name, (find_effect(name).check(values),))
         for name, values in (
@@ -770,10 +771,14 @@ def test_states_run_side_by_side_as_they_do_alone():
     # a limit below the other one: no such effect runs
     values = find_effect('saturation').check({'high': 0.5})
     impossible = Added('saturation', ({**values, 'low': 0.9},))
-    *columns, none = simulator.added([*each, impossible])
+
+    def changed(effects):
+        return simulator.varied([(state.with_effect(a), a.effect, None) for a in effects])
+
+    *columns, none = changed([*each, impossible])
     assert none is None
     for added, column in zip(each, columns, strict=True):
-        assert np.array_equal(column, simulator.added([added])[0]) and np.any(column)
+        assert np.array_equal(column, changed([added])[0]) and np.any(column)
 
 
 @pytest.mark.parametrize('m', [12, 30, 49])
@@ -800,9 +805,9 @@ def test_what_is_kept_from_the_run_before_changes_nothing():
     ):
         added = Added(name, (values,))
         added = Added(name, (added.effect.check(values),))
-        np.testing.assert_allclose(
-            now + simulator.added([added])[0], simulator.run(state.with_effect(added)), atol=1e-12
-        )
+        later = state.with_effect(added)
+        [change] = simulator.varied([(later, added.effect, None)])
+        np.testing.assert_allclose(now + change, simulator.run(later), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -110,11 +110,11 @@ def test_decays_count_from_where_the_record_does(moved):
     assert rows.fading(0, (0.02,)).max() == 1.0
 
 
-def test_creep_takes_with_it_what_creeps_on():
+def test_a_state_from_rest_does_not_creep_on():
     state = State(slow_model().hysteresis, np.zeros(2), (Added('creep', (CREEP,)),))
     state = replace(state, fading=(0.1, 1.0), earlier=np.ones((2, 2)))
     assert state.only_adds.size == 6 and state.with_only_added(state.only_adds).earlier.all()
-    assert state.without(0).only_adds.size == 2 and not state.without(0).fading
+    assert state.from_rest().only_adds.size == 2 and not state.from_rest().fading
 
 
 def test_a_stage_that_rested_creeps_from_rest():
