@@ -109,11 +109,10 @@ class CandidateSearch:
         """Fit the best sets of a size with all treatments of H and G."""
         # a wide H may have absorbed an effect in part and errs under other motion; a sum of plays
         # may leave an error that another effect fits by accident
-        sets = [s for s in candidates.sets if len(s) == size]
-        for effects in sets[:IN_ALL_WAYS]:
-            best = candidates.of(effects)[0]
+        bests = [c for c in candidates.bests if len(c.effects) == size][:IN_ALL_WAYS]
+        for best in bests:
             # a treatment with a larger error than the best treatment does not count
-            goal = np.inf if effects == sets[0] else self._residual.noise + candidates.left(best)
+            goal = np.inf if best is bests[0] else self._residual.noise + candidates.left(best)
             candidates = candidates.and_these(self._other_ways(candidates, best, goal))
         return candidates
 
@@ -173,8 +172,7 @@ class CandidateSearch:
 
     def _worth_extending(self, candidates: Candidates, size: int) -> list[FittedSet]:
         """Return the best sets of a size to which one more effect is added."""
-        sets = [s for s in candidates.sets if len(s) == size]
-        bests = [c for c in map(candidates.best, sets) if c is not None]
+        bests = [c for c in candidates.bests if len(c.effects) == size]
         if not bests:
             return []
         least = candidates.left(bests[0])
@@ -184,7 +182,7 @@ class CandidateSearch:
         enough = candidates.least_share + self._simulator.rows.square(SMALLEST_EFFECT)
         if least < max(enough, LITTLE * whole):
             return []
-        if any(map(candidates.is_admissible, sets)):
+        if any(candidates.is_admissible(c.effects) for c in bests):
             bests = [c for c in bests if candidates.left(c) <= RIVALS * least]
         elif size > 1:
             return []

@@ -139,14 +139,10 @@ class Candidates:
         return self.of((), beside)[0]
 
     @property
-    def sets(self) -> tuple[tuple[str, ...], ...]:
-        """Sets of effects, ordered by the error of the best candidate of each."""
-        least: dict[tuple[str, ...], float] = {}
-        for c in self.all:
-            best = self.best(c.effects)
-            if best is not None:
-                least[c.effects] = self.left(best)
-        return tuple(sorted(least, key=least.__getitem__))
+    def bests(self) -> tuple[FittedSet, ...]:
+        """The best candidate of each set of effects, ordered by their errors."""
+        bests = map(self.best, dict.fromkeys(c.effects for c in self.all))
+        return tuple(sorted(filter(None, bests), key=self.left))
 
     def is_admissible(self, effects: tuple[str, ...]) -> bool:
         """Return whether a set is large enough, and each effect removes most of the error."""
@@ -238,8 +234,7 @@ class Decision:
 
 def decide(candidates: Candidates) -> Decision:
     """Decide between candidates."""
-    possible = [s for s in candidates.sets if candidates.is_admissible(s)]
-    bests = [c for c in map(candidates.best, possible) if c is not None]
+    bests = [c for c in candidates.bests if candidates.is_admissible(c.effects)]
     if not bests:
         return _set_in(candidates)
     best = _simplest(candidates, bests)
@@ -277,7 +272,8 @@ def _rivals_of(candidates: Candidates, best: FittedSet) -> tuple[tuple[str, ...]
     if candidates.is_part(left, whole):
         # the law of the remaining error is unknown: a rival may remove most of the same error
         most = max(most, left + TAKES * (whole - left))
-    others = [s for s in candidates.sets if len(s) == len(best.effects) and s != best.effects]
+    sets = [c.effects for c in candidates.bests if len(c.effects) == len(best.effects)]
+    others = [s for s in sets if s != best.effects]
     bests = [candidates.best(s, best.effects) for s in others if best.effects not in _narrower(s)]
     return tuple(c.effects for c in bests if c is not None and candidates.left(c) <= most)
 

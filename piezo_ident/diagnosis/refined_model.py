@@ -60,12 +60,14 @@ def refine(
     """
     rows, model = simulator.rows, simulator.model
     fitted, h_is_given = last.fitted, last.way == 'given'
-    e = rows.x - simulator.run(given)
-    shifts = moved_zeros(rows, given, e)
+    before = means((rows.x - simulator.run(given)) ** 2, rows.of_record)
+    # any wrong model has some mean error, so a shift must be several times the other error
+    is_clear = np.abs(given.offsets) > MOVED_ZERO * np.sqrt(before)
+    shifts = np.where(is_clear, given.offsets, 0.0)
     if h_is_given and not findings.effects:
         return Refined(model, given, shifts * model.scaling.Y, is_given=True, h_is_given=True)
     # with the effects in the model, smaller shifts are visible
-    hidden = _hidden_shifts(simulator, given, fitted, means(e * e, rows.of_record))
+    hidden = _hidden_shifts(simulator, given, fitted, before)
     shifts = np.where(shifts == 0.0, hidden, shifts)
     state = replace(fitted.state, offsets=fitted.state.offsets - shifts)
     kept = _at_given_gain(simulator, given, state)
@@ -120,17 +122,6 @@ def _at_rest(model: StageModel) -> float:
     own = tuple(x for x in model.effects if x.name not in TESTED)
     y = replace(model, effects=own).stream().reset(model.scaling.range[0])
     return float(model.scaling.x(y))
-
-
-def moved_zeros(rows: Rows, given: State, e: Array) -> Array:
-    """
-    Find clear shifts of the zero of the sensor, normalised, shape (records,); 0 if none.
-
-    Any wrong model has some mean error, so a shift must be several times the other error e, shape
-    (n,).
-    """
-    rms = np.sqrt(means(e * e, rows.of_record))
-    return np.where(np.abs(given.offsets) > MOVED_ZERO * rms, given.offsets, 0.0)
 
 
 def _range(simulator: Simulator) -> tuple[float, float]:

@@ -198,10 +198,9 @@ def _shares(candidates: Candidates, rounds: Sequence[Round]) -> dict[str, float]
             rest = max(one.before.mean_square - gain - candidates.noise, 0.0)
             share = 1.0 - rest / candidates.left(level)
             shares[name] = max(share, shares.get(name, 0.0))
-    for (name,) in [s for s in candidates.sets if len(s) == 1]:
-        best, level = candidates.best((name,)), candidates.without((name,))
-        if best is not None:
-            shares[name] = 1.0 - candidates.left(best) / candidates.left(level)
+    for best in (c for c in candidates.bests if len(c.effects) == 1):
+        level = candidates.without(best.effects)
+        shares[best.effects[0]] = 1.0 - candidates.left(best) / candidates.left(level)
     return {name: float(np.clip(share, 0.0, 1.0)) for name, share in shares.items()}
 
 

@@ -81,18 +81,9 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
         parts=tuple(parts),
         floor=residual_noise_floor(quiet, stretches),
         lines=lines,
-        curves=curves_of(quiet, stretches),
+        curves=(*_of_motions(quiet, stretches), *_since_step(quiet, stretches)),
         coherence=coherence(clean),
     )
-
-
-#: bins of time of a hold, mean residual in each bin, step as a share of the largest step
-_Hold = tuple[Integers, Array, float]
-
-
-def curves_of(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> tuple[Curve, ...]:
-    """Compute the mean residual over v, dv/dt and the time since a step, if the data have them."""
-    return (*_of_motions(parts, stretches), *_since_step(parts, stretches))
 
 
 def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
@@ -159,7 +150,8 @@ def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> 
     if len(holds) < 2:
         return []
     largest = max(abs(s.step) for s in holds)
-    rows: list[_Hold] = []
+    # bins of time of a hold, mean residual in each bin, step as a share of the largest step
+    rows: list[tuple[Integers, Array, float]] = []
     first = min(2.0 / parts[s.part].piece.sample_rate for s in holds)
     for s in holds:
         t = (np.arange(s.n) + 0.5) / parts[s.part].piece.sample_rate
