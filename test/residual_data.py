@@ -5,7 +5,7 @@
 
 import numpy as np
 from piezo_ident.record.record import Piece, Segment
-from piezo_ident.residual import ResidualPart
+from piezo_ident.residual.stretches import ResidualPart
 from scipy.signal import lfilter
 
 RATE = 2000.0

@@ -28,20 +28,11 @@ from piezo_ident.identification.spectra import high_passed
 from piezo_ident.model.metrics import REVERSED, runs_against
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Fault, Record
-from piezo_ident.residual import (
-    all_stretches,
-    channel_tests,
-    ChannelTest,
-    find_faults,
-    find_lines,
-    LineSearch,
-    NoiseFloor,
-    residual_noise_floor,
-    ResidualPart,
-    without_channels,
-    without_lines,
-)
-from piezo_ident.residual.faults import FaultSearch
+from piezo_ident.residual.beyond_drive import channel_tests, ChannelTest, without_channels
+from piezo_ident.residual.faults import FaultSearch, find_faults
+from piezo_ident.residual.lines import find_lines, LineSearch, without_lines
+from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
 #: effect with a test of its own, by its lines
 HUM = 'periodic_disturbance'

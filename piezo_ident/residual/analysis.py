@@ -15,12 +15,7 @@ from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.lines import find_lines, Line, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.stretches import (
-    all_stretches,
-    block_means,
-    ResidualPart,
-    Stretch,
-)
+from piezo_ident.residual.stretches import all_stretches, block_means, ResidualPart, Stretch
 
 #: most samples of a curve after averaging, bins of a curve, bins in a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6

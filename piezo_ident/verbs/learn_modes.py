@@ -39,7 +39,8 @@ from piezo_ident.model.multi_axis import each_of, EachAxis, MultiAxisModel
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
-from piezo_ident.residual import all_stretches, residual_noise_floor, ResidualPart
+from piezo_ident.residual.noise_floor import residual_noise_floor
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 from piezo_ident.selection.judged import JudgedRun
 from piezo_ident.verbs.predict import free_run
 from piezo_ident.verbs.promised_modes import judged_modes

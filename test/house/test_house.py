@@ -64,7 +64,7 @@ SIZES = {
     'record/tables': (1400, 7),
     'report': (2100, 10),
     'report/figures': (1500, 8),
-    'residual': (2200, 12),
+    'residual': (2000, 12),
     'uncertainty': (900, 12),
 }
 

@@ -29,7 +29,8 @@ from piezo_ident.report.figures.residual import (
 )
 from piezo_ident.report.figures.style import axis_limit, draw_each, envelope, NothingToDraw, safe
 from piezo_ident.report.table import length, number
-from piezo_ident.residual import analyse, ResidualPart
+from piezo_ident.residual.analysis import analyse
+from piezo_ident.residual.stretches import ResidualPart
 import pytest
 
 

@@ -8,7 +8,8 @@ from piezo_ident.common.errors import DataError
 from piezo_ident.excitation.program import Program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import analyse, ResidualPart
+from piezo_ident.residual.analysis import analyse
+from piezo_ident.residual.stretches import ResidualPart
 import pytest
 from residual_data import creep, noise, part_of, RATE, T, V
 

@@ -5,13 +5,9 @@
 
 import numpy as np
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import (
-    all_stretches,
-    channel_tests,
-    find_lines,
-    ResidualPart,
-    without_channels,
-)
+from piezo_ident.residual.beyond_drive import channel_tests, without_channels
+from piezo_ident.residual.lines import find_lines
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 import pytest
 from residual_stages import drives, foreign, RATE
 from scipy.signal import lfilter

@@ -6,8 +6,8 @@
 import numpy as np
 from numpy.testing import assert_allclose
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import ResidualPart
 from piezo_ident.residual.coherence import coherence, cross_spectra
+from piezo_ident.residual.stretches import ResidualPart
 import pytest
 from scipy import signal
 

@@ -10,7 +10,8 @@ from piezo_ident.excitation.program import parse_program, Program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.record.readings.faults import quantum_of
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import find_faults, ResidualPart
+from piezo_ident.residual.faults import find_faults
+from piezo_ident.residual.stretches import ResidualPart
 import pytest
 from scipy.signal import lfilter
 

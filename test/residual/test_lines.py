@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import all_stretches, find_lines, ResidualPart, without_lines
 from piezo_ident.residual.line_spectrum import Series, series_of, Spectrum
+from piezo_ident.residual.lines import find_lines, without_lines
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 import pytest
 from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
 from residual_stages import drives, foreign

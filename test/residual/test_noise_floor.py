@@ -6,8 +6,8 @@
 import numpy as np
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Piece
-from piezo_ident.residual import residual_noise_floor, ResidualPart
-from piezo_ident.residual.stretches import block_means, find_repeats, stretches_of
+from piezo_ident.residual.noise_floor import residual_noise_floor
+from piezo_ident.residual.stretches import block_means, find_repeats, ResidualPart, stretches_of
 import pytest
 from residual_data import creep, misfit, part_of, pink, RATE, V
 from scipy.signal import lfilter

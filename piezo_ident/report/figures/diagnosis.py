@@ -24,7 +24,8 @@ from piezo_ident.report.figures.residual import (
     UNSHADED,
 )
 from piezo_ident.report.figures.style import NothingToDraw, tidy
-from piezo_ident.residual import analyse, ResidualAnalysis, ResidualPart
+from piezo_ident.residual.analysis import analyse, ResidualAnalysis
+from piezo_ident.residual.stretches import ResidualPart
 
 #: at most so many pieces get a picture of their own
 TRACES = 4

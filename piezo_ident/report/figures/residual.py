@@ -17,7 +17,8 @@ from piezo_ident.record.record import Piece
 from piezo_ident.report.figures import style
 from piezo_ident.report.figures.style import COLOURS, NothingToDraw, tidy
 from piezo_ident.report.table import number
-from piezo_ident.residual import Curve, ResidualAnalysis, ResidualPart
+from piezo_ident.residual.analysis import Curve, ResidualAnalysis
+from piezo_ident.residual.stretches import ResidualPart
 from scipy import signal
 
 #: attribute of `Residual`, name, colour
