@@ -7,8 +7,7 @@ List the candidates: each treatment of H and G, with each effect, then with one 
 The hysteresis of a piezo is never exactly a sum of plays.  An effect that already acted during the
 identification has also distorted the identified H and G.  Effects are therefore tried beside the H
 that fits best.  They are also tried with a retuned G if retuning alone clearly lowers the error.
-A wide enough H can imitate each effect that follows the path of the voltage, so these effects are
-tried beside the H as given, too.
+Effects that follow the path of the voltage are tried beside the H as given, too (`decision`).
 """
 
 from __future__ import annotations

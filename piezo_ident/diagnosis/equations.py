@@ -234,11 +234,7 @@ class FitStep:
         if pull is not None:
             A, b = A + pull.A, b + pull.b
         self._A, self._b, self._prior = A, b, prior
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether all energies of the columns are finite numbers."""
-        return bool(np.isfinite(np.diag(self._A)).all())
+        self.is_finite = bool(np.isfinite(np.diag(A)).all())
 
     def solve(self, lower: Array, upper: Array, damping: float = 0.0) -> Array:
         """Compute the bounded step; `damping` is a share of the energy of each column."""

@@ -253,12 +253,16 @@ def make_rows(
             'voltage, or drives the stage over its whole range'
         )
     block, labels = _in_blocks(runs, keep, m)
-    x = [block_means(run.x, m)[good] for run, good in zip(runs, keep, strict=True)]
+    u, x = (
+        np.concatenate([block_means(s, m)[k] for s, k in zip(signals, keep, strict=True)])
+        for signals in ([run.u for run in runs], [run.x for run in runs])
+    )
     record = np.array([names.index(run.record) for run in runs])
     of_record = np.concatenate(
         [np.full(int(good.sum()), k) for good, k in zip(keep, record, strict=True)]
     )
-    group, group_labels = held_out_kinds(labels, _blocks_of(runs, keep, m, block))
+    commands = np.split(u, np.flatnonzero(np.diff(block)) + 1)
+    group, group_labels = held_out_kinds(labels, commands)
     first_of = {run.record: run.piece.start_time for run in reversed(runs)}
     begin = np.array([0.0 if _has_clock(model) else first_of[run.record] for run in runs])
     return Rows(
@@ -272,7 +276,7 @@ def make_rows(
         memories=tuple(_memory(model, *pair) for pair in zip(runs, at_rest, strict=True)),
         m=m,
         keep=keep,
-        x=np.concatenate(x),
+        x=x,
         block=block,
         of_record=of_record,
         fold=np.arange(block.max() + 1) % FOLDS,
@@ -326,12 +330,6 @@ def _in_blocks(runs: Sequence[Run], keep: Sequence[Mask], m: int) -> tuple[Integ
                     labels.append(label)
         blocks.append(number[good])
     return np.unique(np.concatenate(blocks), return_inverse=True)[1], labels
-
-
-def _blocks_of(runs: Sequence[Run], keep: Sequence[Mask], m: int, block: Integers) -> list[Array]:
-    """Return the command of each block, as means over rows."""
-    u = np.concatenate([block_means(r.u, m)[good] for r, good in zip(runs, keep, strict=True)])
-    return np.split(u, np.flatnonzero(np.diff(block)) + 1)
 
 
 def _memory(model: StageModel, run: Run, at_rest: bool) -> Memory:

@@ -267,7 +267,8 @@ def place_of(effect: type[Effect] | None, operators: Sequence[Operator]) -> int:
 
 def place_of_core(operators: Sequence[Operator]) -> int:
     """Find the link with H and the effects around H."""
-    return next(i for i, op in enumerate(operators) if isinstance(_core(op), HysteresisOperator))
+    cores = (isinstance(op, HysteresisOperator) or effects_around(op) for op in operators)
+    return next(i for i, is_core in enumerate(cores) if is_core)
 
 
 def effects_around(operator: Operator) -> list[Effect]:
@@ -282,9 +283,3 @@ def effects_around(operator: Operator) -> list[Effect]:
 def moving_effects(operator: Operator) -> list[Effect]:
     """List the effects around H whose contribution depends on the coefficients of H."""
     return [effect for effect in effects_around(operator) if effect.of_hysteresis != 'not']
-
-
-def _core(operator: Operator) -> Operator:
-    """Return the operator inside the effects around H; another link is returned unchanged."""
-    around = effects_around(operator)
-    return around[-1].inner if around else operator

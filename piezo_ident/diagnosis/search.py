@@ -4,9 +4,8 @@
 """
 Run one round of the search: find the candidates that lower the error on held-out data.
 
-Each candidate is tried with its effect switched slightly on (`trial_scores`).  The gain is
-compared with the gain on surrogates of the residual, which chance alone produces.  The most
-promising candidates are then fitted together with the rest of the model.
+Each candidate is tried (`trial_scores`).  Its gain is compared with the gain on surrogates of the
+residual, which chance alone produces.  The most promising candidates are then fitted jointly.
 """
 
 from __future__ import annotations
