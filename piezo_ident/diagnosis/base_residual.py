@@ -64,20 +64,11 @@ class BaseResidual:
     """
     The model with another H, and the findings in its residual.
 
-    Attributes
-    ----------
-    given : State
-        The diagnosed model, with an offset in each record.
-    plays, wide : Fitted
-        H refitted as plays, and as the better of the wide laws.
-    channels, lines, floor
-        Tests of further channels, search for lines, and noise floor.
-    noise, single : float
-        Mean squares of the noise of a row, and of single samples (None if unknown).
-    missed : float
-        Possible error of G on this motion, rms in % of stroke.
-    faults : tuple of Fault
-        Faults of the data in the residual of the diagnosed model.
+    `given` is the diagnosed model, with an offset in each record.  `plays` and `wide` hold H
+    refitted as plays, and as the better of the wide laws.  `noise` and `single` are the mean
+    squares of the noise of a row, and of single samples (None if unknown).  `missed` is the
+    possible error of G on this motion, rms in % of stroke.  `faults` are faults of the data in the
+    residual of the diagnosed model.
     """
 
     given: State
@@ -116,7 +107,15 @@ def base_residual(simulator: Simulator, faults: FaultSearch) -> BaseResidual:
         given = with_earlier_motion(simulator, fit_jointly(simulator, given)).state
     plays, wide = refits(simulator, given)
     _check_related(simulator, given, plays)
-    channels, lines, floor = _beside_the_drive(simulator, wide.state)
+    parts = _parts(simulator, wide.state)
+    channels = channel_tests(parts)
+    # another axis that moves in sines causes lines, too
+    parts = without_channels(parts, channels)
+    lines = find_lines(parts, all_stretches(parts))
+    # effects can explain hum and another axis: only the rest is noise
+    resting = _parts(simulator, wide.state, whole=True)
+    quiet = [without_lines(part, lines.lines) for part in without_channels(resting, channels)]
+    floor = residual_noise_floor(quiet, all_stretches(resting))
     noise, single = floor.squares(faults.quantum, rows.m, abs(model.scaling.Y))
     left = float(np.mean((rows.x - simulator.run(given)) ** 2))
     # the estimated noise is too large while a memory settles: periods then differ.  No model errs
@@ -136,21 +135,6 @@ def _parts(simulator: Simulator, state: State, *, whole: bool = False) -> list[R
         ResidualPart(run.record, run.piece, (run.x - x) * Y, run.use if whole else run.known)
         for run, x in zip(simulator.rows.runs, simulator.full(state), strict=True)
     ]
-
-
-def _beside_the_drive(
-    simulator: Simulator, state: State
-) -> tuple[tuple[ChannelTest, ...], LineSearch, NoiseFloor]:
-    """Test a state's residual for further channels and lines, and estimate the remaining noise."""
-    parts = _parts(simulator, state)
-    channels = channel_tests(parts)
-    # another axis that moves in sines causes lines, too
-    parts = without_channels(parts, channels)
-    found = find_lines(parts, all_stretches(parts))
-    # effects can explain hum and another axis: only the rest is noise
-    resting = _parts(simulator, state, whole=True)
-    quiet = [without_lines(part, found.lines) for part in without_channels(resting, channels)]
-    return channels, found, residual_noise_floor(quiet, all_stretches(resting))
 
 
 def _check_related(simulator: Simulator, given: State, base: Fitted) -> None:

@@ -250,16 +250,10 @@ SWEEP = 60
 
 def loops(low: float, high: float) -> Array:
     """Compute a motion from `low` through loops from both ends of a range, and loops between."""
-    turns = [0.0]
-    for level in np.arange(1, 7) / 6:
-        turns += [level, 0.0]
-    turns.append(1.0)
-    for level in np.arange(1, 6) / 6:
-        turns += [level, 1.0]
-    turns.append(0.0)
-    for level in (0.3, 0.6, 0.9):
-        turns += [level, level - 0.15, level, level - 0.15]
-    turns.append(0.0)
+    lower = [x for level in np.arange(1, 7) / 6 for x in (level, 0.0)]
+    upper = [x for level in np.arange(1, 6) / 6 for x in (level, 1.0)]
+    small = [x for level in (0.3, 0.6, 0.9) for x in 2 * (level, level - 0.15)]
+    turns = [0.0, *lower, 1.0, *upper, 0.0, *small, 0.0]
     sweeps = [
         np.linspace(a, b, max(2, round(SWEEP * abs(b - a))), endpoint=False)
         for a, b in itertools.pairwise(turns)

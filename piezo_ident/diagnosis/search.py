@@ -74,20 +74,11 @@ class Round:
     """
     One round of the search.
 
-    Attributes
-    ----------
-    before : Fitted
-        The fit to which the candidates were added.
-    gains : dict of str to float
-        Mean square that each possible candidate gains, in its best trial or in its joint fit.
-    contenders : tuple of Fitted
-        Candidates after the joint fit that show, ordered by error.
-    chance : dict of str to float
-        Largest mean square that a candidate gains on surrogates of the residual.
-    visible : dict of str to float
-        Share of the columns of a candidate that a refit of the rest cannot imitate.
-    warnings : tuple of str
-        Candidates whose joint fit failed.
+    `before` is the fit to which the candidates were added.  `gains` holds the mean square that
+    each possible candidate gains in its best trial or in its joint fit, and `chance` the largest
+    mean square that it gains on surrogates of the residual.  `visible` is the share of the columns
+    of a candidate that a refit of the rest cannot imitate.  The `contenders` are candidates after
+    the joint fit that show, ordered by error; `warnings` name candidates whose joint fit failed.
     """
 
     before: Fitted
@@ -326,10 +317,8 @@ def fit_starts(
             tick()
             while wait(futures, ASKED).not_done:
                 tick()
-        except BaseException:
-            stopped.set()
-            raise
         finally:
+            stopped.set()
             wait(futures)
             for copy in copies[1:]:
                 copy.forget()

@@ -70,26 +70,14 @@ class Stage:
     """
     Parameters of a stage, normalised; G has gain one.
 
-    Attributes
-    ----------
-    law : HysteresisLaw
-    coefficients : ndarray, shape (size,)
-        Coefficients of the law.
-    dynamics : Dynamics
-        G without its delay; ``Dynamics.unit()`` has no free parameter.
-    delay : int
-        Delay [samples].
-    offsets : ndarray, shape (records,)
-    taus, creep : ndarray, shape (k,)
-        Time constants of creep [s] and their shares.
-    lags : ndarray, shape (stretches, k)
-        Distance of each element of creep from rest at the first sample.
-    resting : ndarray of bool, shape (stretches,)
-        Stretches that begin with all creep at rest.
-    rested : bool
-        Whether creep is at rest at the start of a record whose memory is known.
-    starts, guesses : ndarray, shape (records, PARTS)
-        Shares m of the memory, and their first guesses in the prior; guesses of zero are known.
+    `coefficients` are those of the law, shape (size,).  `dynamics` is G without its delay
+    (``Dynamics.unit()`` has no free parameter), and `delay` counts samples.  Each record has an
+    entry of `offsets`, shape (records,).  `taus` and `creep` are the time constants of creep [s]
+    and its shares, shapes (k,); `lags` are the distances of each element of creep from rest at the
+    first sample, shape (stretches, k).  `resting` marks stretches that begin with all creep at
+    rest, and `rested` tells whether creep is at rest at the start of a record whose memory is
+    known.  `starts` and `guesses` are the shares m of the memory and their first guesses in the
+    prior, shapes (records, PARTS); guesses of zero are known.
     """
 
     law: HysteresisLaw
@@ -110,20 +98,9 @@ class Stage:
         """Make a stage whose H is a straight line with the gain of `dynamics`."""
         c = np.zeros(law.size)
         c[-1] = dynamics.gain
-        none = np.empty(0)
-        return cls(
-            law,
-            c,
-            dynamics.normalised(),
-            delay,
-            np.zeros(guesses.shape[0]),
-            none,
-            none,
-            np.empty((0, 0)),
-            np.empty(0, dtype=bool),
-            guesses.copy(),
-            guesses,
-        )
+        G, none, offsets = dynamics.normalised(), np.empty(0), np.zeros(guesses.shape[0])
+        lags, resting = np.empty((0, 0)), np.empty(0, dtype=bool)
+        return cls(law, c, G, delay, offsets, none, none, lags, resting, guesses.copy(), guesses)
 
     def with_creep(self, taus: Array, stretches: Sequence[Stretch]) -> Stage:
         """Add elements of creep that have no share yet."""

@@ -33,14 +33,8 @@ class Candidate:
     """
     Fit with a name and its errors on held-out data.
 
-    Attributes
-    ----------
-    name : str
-    fit : Fit
-    blocks, kinds : float
-        Mean squares, normalised; `kinds` equals `blocks` if no kinds can be held out.
-    effects : int
-        Number of effects beyond H, G and the delay.
+    `blocks` and `kinds` are mean squares, normalised; `kinds` equals `blocks` if no kinds can be
+    held out.  `effects` is the number of effects beyond H, G and the delay.
     """
 
     name: str

@@ -31,12 +31,8 @@ class SlowMotion(NamedTuple):
     """
     Errors of modes and elements of creep, averaged over blocks, about the mean of each piece.
 
-    Attributes
-    ----------
-    w, u : ndarray, shape (blocks, axes)
-        Errors and voltages [V].
-    lags : ndarray, shape (blocks, axes, m)
-        Elements of creep [V].
+    `w` are errors and `u` voltages [V], shapes (blocks, axes); `lags` are elements of creep [V],
+    shape (blocks, axes, m).
     """
 
     w: Array
