@@ -137,10 +137,7 @@ def _beginnings(model: StageModel, records: Sequence[Record], most: int) -> list
 
 
 def _diagnosed(
-    model: StageModel,
-    records: Sequence[Record],
-    settings: DiagnosisSettings,
-    progress: Progress,
+    model: StageModel, records: Sequence[Record], settings: DiagnosisSettings, progress: Progress
 ) -> Diagnosis:
     """Diagnose sound records; the result holds no sentence yet."""
     progress('residual', 0.0)

@@ -73,7 +73,11 @@ def refine(
     kept = _at_given_gain(simulator, given, state)
     # gain and drift in the next record are unknown
     lasts = not findings.effects or not all(find_effect(x).time_driven for x in findings.effects)
-    span = model.scaling.range if h_is_given else _range(simulator)
+    span, (low, high) = model.scaling.range, rows.driven
+    if not h_is_given:
+        # plays with thresholds beyond the driven range have no weight any more
+        is_whole = rows.covers(span)
+        span = (min(span[0], low), max(span[1], high)) if is_whole else (low, high)
     told = errors if lasts and kept is state else errors[:1]
     refined = _model(simulator, kept, findings, span, told)
     return Refined(refined, state, shifts * model.scaling.Y, False, h_is_given)
@@ -122,16 +126,6 @@ def _at_rest(model: StageModel) -> float:
     own = tuple(x for x in model.effects if x.name not in TESTED)
     y = replace(model, effects=own).stream().reset(model.scaling.range[0])
     return float(model.scaling.x(y))
-
-
-def _range(simulator: Simulator) -> tuple[float, float]:
-    """Return the range of voltages in which an H refitted to the rows holds."""
-    low, high = simulator.rows.driven
-    least, most = simulator.model.scaling.range
-    # plays with thresholds beyond the driven range have no weight any more
-    if not simulator.rows.covers((least, most)):
-        return low, high
-    return min(least, low), max(most, high)
 
 
 def _model(

@@ -262,10 +262,7 @@ def loops(low: float, high: float) -> Array:
 
 
 def toward_given(
-    simulator: Simulator,
-    given: State,
-    fitted: Fitted,
-    tick: Callable[[], None] = lambda: None,
+    simulator: Simulator, given: State, fitted: Fitted, tick: Callable[[], None] = lambda: None
 ) -> Fitted:
     """
     Repeat a fit of rows without labelled kinds of motion, drawn to the given H.

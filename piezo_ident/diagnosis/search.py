@@ -22,14 +22,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import Cancelled
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
-from piezo_ident.diagnosis.joint_fit import (
-    fit_base,
-    fit_jointly,
-    Fitted,
-    POLISHING,
-    tried,
-    Until,
-)
+from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly, Fitted, POLISHING, tried, Until
 from piezo_ident.diagnosis.next_experiment import look_alikes
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import State

@@ -220,9 +220,6 @@ FEWEST = 20
 #: time over which the mean, size and speed of a motion are computed [s]
 LOCAL = 0.25
 
-#: rows, shape (k,), and columns to project out there, shape (k, p)
-Place = tuple[Integers, Array]
-
 
 def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     """
@@ -255,7 +252,7 @@ def shows(simulator: Simulator, fitted: Fitted, noise: float) -> bool:
     return low <= kappa <= high and kappa > STANDARD_ERRORS * error
 
 
-def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:
+def _at_rest(rows: Rows, y: Array) -> Iterator[tuple[Integers, Array]]:
     """Yield the rows of each rest of the command, with a constant to project out."""
     first = 0
     for run, keep in zip(rows.runs, rows.keep, strict=True):
@@ -269,7 +266,7 @@ def _at_rest(rows: Rows, y: Array) -> Iterator[Place]:
         first += int(keep.sum())
 
 
-def _in_motion(rows: Rows, y: Array) -> Iterator[Place]:
+def _in_motion(rows: Rows, y: Array) -> Iterator[tuple[Integers, Array]]:
     """Yield the rows of each run, and columns of a gain by local mean, size and speed."""
     first = 0
     for run, keep in zip(rows.runs, rows.keep, strict=True):
@@ -287,7 +284,8 @@ def _in_motion(rows: Rows, y: Array) -> Iterator[Place]:
         first += parts[0].size
 
 
-_PLACES: dict[str, Callable[[Rows, Array], Iterator[Place]]] = {
+#: rows, shape (k,), in which an effect alone acts, and columns to project out there, shape (k, p)
+_PLACES: dict[str, Callable[[Rows, Array], Iterator[tuple[Integers, Array]]]] = {
     'creep': _at_rest,
     'thermal_drift': _at_rest,
     'gain_drift': _in_motion,

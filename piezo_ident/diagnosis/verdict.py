@@ -157,9 +157,7 @@ def _hidden(candidates: Candidates) -> Class | None:
 
 
 def candidates_of(
-    candidates: Candidates,
-    rounds: Sequence[Round],
-    findings: Findings,
+    candidates: Candidates, rounds: Sequence[Round], findings: Findings
 ) -> tuple[Candidate, ...]:
     """List every candidate that was not added, its share when added alone, and a reason."""
     rows, seen = candidates.rows, visible(rounds)
