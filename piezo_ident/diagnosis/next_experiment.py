@@ -245,7 +245,8 @@ LOOK_ALIKES = (
     ('backlash', 'saturation'),
 )
 _HOLDS = 'holds of 10 s and more after steps of both signs, with the first motion at the end again'
-_TWO_SIZES = 'a sine near the first resonance at two amplitudes, one a tenth of the other'
+_TWO_SINES = 'one fast sine at two amplitudes'
+_FULL_SINE = 'a sine of the full range close to the first resonance, where y no longer follows v'
 _FAST = 'a multisine that reaches beyond the first resonance'
 #: experiment that separates two effects
 _SEPARATED_BY = {
@@ -255,9 +256,7 @@ _SEPARATED_BY = {
         'the same motion about a low and a high bias, at the start and at the end: a drifting '
         'gain moves the high one more'
     ),
-    ('creep', 'rate_dependent_hysteresis'): (
-        'a hold of 2 s after a step, and one fast sine at two amplitudes'
-    ),
+    ('creep', 'rate_dependent_hysteresis'): f'a hold of 2 s after a step, and {_TWO_SINES}',
     ('noncongruent_minor_loops', 'sensor_nonlinearity'): (
         'minor loops of two widths, each at five biases that are reached from below and from '
         'above: a sensor bends both branches by one function of y'
@@ -273,18 +272,16 @@ _SEPARATED_BY = {
     ('noncongruent_minor_loops', 'preload_loss'): (
         'minor loops of two widths at ten biases: a contact changes those alone that pass it'
     ),
-    ('even_nonlinearity', 'sensor_nonlinearity'): (
-        'a sine of the full range close to the first resonance, where y no longer follows v'
-    ),
-    ('preload_loss', 'sensor_nonlinearity'): (
-        'a sine of the full range close to the first resonance, where y no longer follows v'
-    ),
+    ('even_nonlinearity', 'sensor_nonlinearity'): _FULL_SINE,
+    ('preload_loss', 'sensor_nonlinearity'): _FULL_SINE,
     ('backlash', 'saturation'): 'turns in the middle of the range as well as at its ends',
-    ('amplifier_lag', 'slew_limit'): 'one fast sine at two amplitudes',
-    ('amplifier_lag', 'rate_dependent_hysteresis'): 'one fast sine at two amplitudes',
-    ('delay_change', 'rate_dependent_hysteresis'): 'one fast sine at two amplitudes',
-    ('changed_dynamics', 'rate_dependent_hysteresis'): 'one fast sine at two amplitudes',
-    ('backlash', 'changed_dynamics'): _TWO_SIZES,
+    ('amplifier_lag', 'slew_limit'): _TWO_SINES,
+    ('amplifier_lag', 'rate_dependent_hysteresis'): _TWO_SINES,
+    ('delay_change', 'rate_dependent_hysteresis'): _TWO_SINES,
+    ('changed_dynamics', 'rate_dependent_hysteresis'): _TWO_SINES,
+    ('backlash', 'changed_dynamics'): (
+        'a sine near the first resonance at two amplitudes, one a tenth of the other'
+    ),
     ('amplifier_lag', 'delay_change'): _FAST,
     ('changed_dynamics', 'delay_change'): _FAST,
     ('amplifier_lag', 'changed_dynamics'): _FAST,
