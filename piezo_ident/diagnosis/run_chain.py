@@ -216,10 +216,11 @@ class _Once(HysteresisOperator):
 
 def asked_once(operator: Operator, answer: list[Any]) -> Operator:
     """Return a link whose H, if any, keeps its last output in a list."""
-    core = _core(operator)
+    around = effects_around(operator)
+    core = around[-1].inner if around else operator
     if not isinstance(core, HysteresisOperator):
         return operator
-    around, once = effects_around(operator), _Once(core, answer)
+    once = _Once(core, answer)
     if not around:
         return once
     around[-1].inner = once
