@@ -335,7 +335,7 @@ def test_in_the_end_an_unlabelled_record_is_fitted_whole():
     (piece,) = record.pieces
     # it stands still until then
     start, n = (round(t * piece.sample_rate) for t in (3.0, 6.0))
-    few = Settings(max_order=4, thresholds=10)
+    few = Settings(max_order=5, thresholds=10)
     result = identify(Record((piece.cut(start, n),), 'three seconds'), few)
     assert 'fitted to all of it' in result.warnings[0]
     e = (piece.y - result.model.simulate(piece.v))[n:]
