@@ -24,7 +24,6 @@ or wait with `matched`: both see to it that the nodes know of all readers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import functools
 import gc
 import os
 from pathlib import Path
@@ -42,7 +41,6 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from diagnostic_msgs.msg import DiagnosticArray
 from nursery import can_copy
 from observer import ENDS, Observer
-from piezo_ident.nodes.subscriptions import between_turns
 from processes import alive, crowd, Handle, in_time, LIMIT, listens, take_domain
 import rclpy
 from rclpy.context import Context
@@ -61,8 +59,9 @@ PROFILE = Path(__file__).with_name('prompt_discovery.xml')
 class Graph(Observer):
     """Node processes in a ROS domain of their own, and an observer."""
 
-    #: graphs of this process that spin
-    spinning: ClassVar[list[Graph]] = []
+    #: what lives as long as this process: the middleware ends it now and then, where the last node
+    #: of a context is destroyed.  Each keeps its domain, in which nobody else is
+    kept: ClassVar[list[object]] = []
 
     def __enter__(self) -> Graph:
         self.domain, self._lock = take_domain()
@@ -103,7 +102,6 @@ class Graph(Observer):
         gc.freeze()
         self._thread = threading.Thread(target=self._spin, name='observer', daemon=True)
         self._thread.start()
-        self.spinning.append(self)
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -114,34 +112,26 @@ class Graph(Observer):
             self._end.set()
             # a node that is destroyed while the thread spins ends the process
             self._thread.join(60.0)
-            self.spinning.remove(self)
-            # what is frozen keeps entities of nodes that are destroyed
+            # what is frozen keeps entities of the node
             gc.unfreeze()
-            self._destroy()
+            self._leave()
             shutil.rmtree(self.folder, ignore_errors=True)
-            self._lock.close()
         if kind is None:
             assert not self._unknown, f'states that no table knows: {self._unknown}'
             # what ros2 topic echo shows of a text ends at 128 characters
             assert not self._unfit, f'too long, or the prose is not the last value: {self._unfit}'
 
-    def _destroy(self) -> None:
-        """Destroy the node while no observer of another graph waits, which ended the process."""
-        done = threading.Event()
-
-        def destroy() -> None:
-            try:
-                self._executor.shutdown(timeout_sec=1.0)
-                self.node.destroy_node()
-                rclpy.shutdown(context=self.context)
-            finally:
-                done.set()
-
-        work = destroy
-        for other in [g for g in self.spinning if g._thread.is_alive()]:
-            work = functools.partial(between_turns, other.node, work)
-        work()
-        assert done.wait(LIMIT)
+    def _leave(self) -> None:
+        """Destroy what the observer heard and said with, and keep its node."""
+        node = self.node
+        self._executor.shutdown(timeout_sec=1.0)
+        for entity in list(node.subscriptions):
+            node.destroy_subscription(entity)
+        for entity in list(node.publishers):
+            node.destroy_publisher(entity)
+        for entity in list(node.clients):
+            node.destroy_client(entity)
+        self.kept.append((node, self.context, self._lock))
 
     def _spin(self) -> None:
         while not self._end.is_set():
