@@ -168,10 +168,8 @@ class FeedforwardNode(DrivingNode):
 
     def _is_outdated(self, new: Tracker | Successor) -> bool:
         """Return whether a model was prepared for other limits, or for a voltage long ago."""
-        tracker = self._tracker
         if isinstance(new, Successor):
-            # the voltage is kept sample by sample for some seconds
-            return tracker is None or not tracker.remembers(new)
+            return self._tracker is None or not self._tracker.remembers(new)
         return (new.settings, new.follow) != (self._settings(), self.values['follow'])
 
     # services
@@ -256,9 +254,8 @@ class FeedforwardNode(DrivingNode):
             self._take(*block)
 
     def _take(self, samples: Samples, sequence: int | None, resting: Collection[str]) -> None:
-        verdict = self._sample_clock.judge(
-            samples, sequence, lambda: publisher_ids(self, self._references[''])
-        )
+        publishers = partial(publisher_ids, self, self._references[''])
+        verdict = self._sample_clock.judge(samples, sequence, publishers)
         if not verdict.is_taken:
             self._faults.note('refused', f'a block is refused: {verdict.reason}')
             return
@@ -266,8 +263,7 @@ class FeedforwardNode(DrivingNode):
         x, faults = self._wanted.take(samples, verdict, resting, self.values['longest'])
         for fault in faults:
             self._faults.note(*fault)
-        if is_new:
-            self._answered = self._last
+        self._answered = self._last if is_new else self._answered
         if (tracker := self._tracker) is not None:
             self._counts['streams'] += is_new
             self._play(tracker.process(x, is_new and self._state == 'tracking'))
@@ -312,8 +308,6 @@ class FeedforwardNode(DrivingNode):
         for block in errors:
             self._tracking_errors[block.quantity].publish(to_message(block))
 
-    # work
-
     def work(self) -> str:
         """Watch for the end of a reference, or repeat it."""
         self._looks.look()
@@ -345,11 +339,11 @@ class FeedforwardNode(DrivingNode):
     def report_state(self) -> None:
         """Publish state, tracking error and problems."""
         problems = self._problems()
-        text = NOW.get(self._state, self._end[1])
+        text, progress = NOW.get(self._state, self._end[1]), 0.0
         if self._state == 'idle' and self._tracker is None:
             text = 'for a model'
         elif self._state == 'learning' and self._learner:
-            text = self._learner.text
+            text, progress = self._learner.text, self._learner.progress
         elif self._state in DRIVING:
             text += f', with {self._source}'
         level = WARN if problems or self._state == 'failed' else OK
@@ -359,8 +353,6 @@ class FeedforwardNode(DrivingNode):
         if errors:
             values |= {f'tracking_percent{tail}': error for tail, error in errors.items()}
             brief = f'{" and ".join(errors.values())} % of stroke, tracking error; {text}'
-        learner = self._learner if self._state == 'learning' else None
-        progress = learner.progress if learner else 0.0
         self.report_status(
             self._state, progress, text, level, brief=brief, problems=problems, **values
         )
