@@ -64,11 +64,20 @@ class BaseResidual:
     """
     The model with another H, and the findings in its residual.
 
-    `given` is the diagnosed model, with an offset in each record.  `plays` and `wide` hold H
-    refitted as plays, and as the better of the wide laws.  `noise` and `single` are the mean
-    squares of the noise of a row, and of single samples (None if unknown).  `missed` is the
-    possible error of G on this motion, rms in % of stroke.  `faults` are faults of the data in the
-    residual of the diagnosed model.
+    Attributes
+    ----------
+    given : State
+        The diagnosed model, with an offset in each record.
+    plays, wide : Fitted
+        H refitted as plays, and as the better of the wide laws.
+    channels, lines, floor
+        Tests of further channels, search for lines, and noise floor.
+    noise, single : float
+        Mean squares of the noise of a row, and of single samples (None if unknown).
+    missed : float
+        Possible error of G on this motion, rms in % of stroke.
+    faults : tuple of Fault
+        Faults of the data in the residual of the diagnosed model.
     """
 
     given: State

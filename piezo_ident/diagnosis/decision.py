@@ -213,10 +213,17 @@ class Decision:
     """
     Result of the decision.
 
-    `best` is the candidate that was taken, if an effect was found.  `whole` is the error to
-    explain, a mean square: the error of the best H and G without an effect, or, for an effect that
-    has set in since the identification (`set_in`), the error of the model as given.  `names` is a
-    class: the effects of the best set and of its rivals that some of these sets lack.
+    Attributes
+    ----------
+    best : FittedSet or None
+        The candidate that was taken, if an effect was found.
+    whole : float
+        Error to explain, a mean square: the error of the best H and G without an effect.  For an
+        effect that has set in since the identification, the error of the model as given.
+    names : tuple of str
+        A class: effects of the best set and of its rivals that some of these sets lack.
+    set_in : bool
+        Whether an effect has set in since the identification.
     """
 
     best: FittedSet | None

@@ -85,13 +85,23 @@ class Until:
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """
-    Result of a joint fit: the fitted state, and the columns of H that the fit used.
+    Result of a joint fit.
 
-    `e` is the residual of the rows, measured minus predicted, normalised, shape (n,).  `moving`
-    holds the derivatives of the prediction by the free parameters, shape (n, q).  `free` marks the
-    columns that are not on a bound, shape (p,), and `prior` has the same shape.  `errors` and
-    `transfer` are the sums of squares of each block, held out in spread sets and in whole kinds of
-    motion.  `pull` is information besides the rows, for the free columns.
+    Attributes
+    ----------
+    state, base : State, BaseColumns
+        The fitted state, and the columns of H that the fit used.
+    e : ndarray, shape (n,)
+        Residual of the rows, measured minus predicted, normalised.
+    moving : ndarray, shape (n, q)
+        Derivatives of the prediction by the free parameters.
+    free : ndarray of bool, shape (p,)
+        Columns that are not on a bound.
+    parameters, prior : tuple of FreeParameter, ndarray, shape (p,)
+    errors, transfer : ndarray, shape (blocks,)
+        Sum of squares of each block, held out in spread sets and in whole kinds of motion.
+    pull : Pull or None
+        Normal equations of the information besides the rows, for the free columns.
     """
 
     state: State

@@ -76,8 +76,7 @@ def warnings_of(simulator: Simulator, refined: Refined, floor: NoiseFloor) -> li
             'identification, or they have changed since'
         )
     if state.fading:
-        earlier = simulator.added_columns(state)[:, state.offsets.size :] @ state.earlier.ravel()
-        crept = simulator.rows.percent(float(np.max(earlier**2)))
+        crept = simulator.rows.percent(float(np.max(simulator.crept(state) ** 2)))
         found.append(
             f'the stage still crept from motion before a record, by up to {crept:.2g} % of '
             'stroke; this was fitted and is no part of any error. A free run of such a record '

@@ -161,11 +161,18 @@ class Unseen:
     """
     Errors on a record that took no part in a diagnosis, % of its stroke.
 
-    `before` and `after` are the errors of the given and of the refined model.  If the record does
-    not start at rest, its start is estimated from a first part, and the errors exclude this part.
-    `before_centred` and `after_centred` are the same errors without their mean, as a sensor may
-    have been zeroed again.  `n` is the number of judged samples.  `sines` holds the frequency [Hz]
-    of each sine, and the errors before and after in steady state.
+    Attributes
+    ----------
+    record : str
+    before, after : float
+        Errors of the given and of the refined model.  If the record does not start at rest, its
+        start is estimated from a first part, and the errors exclude this part.
+    before_centred, after_centred : float
+        The same errors without their mean, as a sensor may have been zeroed again.
+    n : int
+        Number of judged samples.
+    sines : tuple of (float, float, float)
+        Frequency [Hz] of each sine, and the errors before and after in steady state.
     """
 
     record: str

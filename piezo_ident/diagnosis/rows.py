@@ -47,21 +47,35 @@ Memory = Callable[[Array], Array]
 @dataclass(frozen=True, eq=False)
 class Rows:
     """
-    Records, prepared for a regression: n rows, each a mean of `m` samples.
+    Records, prepared for a regression.
 
-    The `runs` are uniformly sampled pieces, normalised by the scaling of the model.  For each run
-    `record` is the number of its record, an index of `names`; `keep` marks the rows that count:
-    sound for the most part, and behind the unknown start.  `memories` compute the play outputs at
-    the start of each run from the thresholds.  `begin` is the start of the record of each run [s],
-    as a drift begins with the record, whatever its clock was set to; it is zero if an effect of
-    the model already depends on the time of the clock.  `duration` is the time from start to end
-    of the longest record [s], and `stroke` the largest range of the displacement in a record,
-    normalised.
-
-    `x` is the measured displacement of the rows, normalised; `block` and `of_record` are the block
-    and the record of each row, shapes (n,).  Blocks with the same number in `fold` (spread over
-    all data) or in `group` (kinds of motion, with the names `labels`) are held out together,
-    shapes (blocks,).  `label` is the segment label of each block.
+    Attributes
+    ----------
+    runs : tuple of Run
+        Uniformly sampled pieces, normalised by the model's scaling.
+    record, names : ndarray of int, shape (runs,), tuple of str
+        The record of each run, and the names of the records.
+    begin : ndarray, shape (runs,)
+        Start of the record of each run [s], as a drift begins with the record, whatever its clock
+        was set to.  Zero if an effect of the model already depends on the time of the clock.
+    duration : float
+        Time from start to end of the longest record [s].
+    memories : tuple of callable
+        Play outputs at the start of each run, as a function of the thresholds.
+    m : int
+        Samples in a row.
+    keep : tuple of ndarray of bool
+        For each run, the rows that count: sound for the most part, and behind the unknown start.
+    x : ndarray, shape (n,)
+        Measured displacement of the rows, normalised.
+    block, of_record : ndarray of int, shape (n,)
+        Block and record of each row.
+    fold, group : ndarray of int, shape (blocks,)
+        Numbers of blocks that are held out together: spread over all data, or as kinds of motion.
+    label, labels : tuple of str
+        Segment label of each block, and name of each group.
+    stroke : float
+        Largest range of the displacement in a record, normalised.
     """
 
     runs: tuple[Run, ...]

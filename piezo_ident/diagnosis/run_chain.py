@@ -32,10 +32,18 @@ class Behind:
     """
     Links of a run behind a place in its chain, with the unchanged signal at each link.
 
-    `rests` holds the signal at rest before each link and behind the last, and `blocks` the signal
-    of the whole run at the same places.  The first block is enough if all links are linear.  A row
-    is the mean of `m` samples.  `new` tells that the first link has changed since the blocks were
-    kept.
+    Parameters
+    ----------
+    operators : sequence of Operator
+    rests : sequence of float
+        The signal at rest before each link, and behind the last.
+    blocks : sequence of Block
+        The signal of the whole run at the same places.  The first block is enough if all links are
+        linear.
+    m : int
+        Samples in a row.
+    new : bool, optional
+        Whether the first link has changed since the blocks were kept.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from operator import attrgetter
 from threading import Event
 from typing import NamedTuple
@@ -67,11 +67,20 @@ class Round:
     """
     One round of the search.
 
-    `before` is the fit to which the candidates were added.  `gains` holds the mean square that
-    each possible candidate gains in its best trial or in its joint fit, and `chance` the largest
-    mean square that it gains on surrogates of the residual.  `visible` is the share of the columns
-    of a candidate that a refit of the rest cannot imitate.  The `contenders` are candidates after
-    the joint fit that show, ordered by error; `warnings` name candidates whose joint fit failed.
+    Attributes
+    ----------
+    before : Fitted
+        The fit to which the candidates were added.
+    gains : dict of str to float
+        Mean square that each possible candidate gains, in its best trial or in its joint fit.
+    contenders : tuple of Fitted
+        Candidates after the joint fit that show, ordered by error.
+    chance : dict of str to float
+        Largest mean square that a candidate gains on surrogates of the residual.
+    visible : dict of str to float
+        Share of the columns of a candidate that a refit of the rest cannot imitate.
+    warnings : tuple of str
+        Candidates whose joint fit failed.
     """
 
     before: Fitted
@@ -211,8 +220,7 @@ class _JointFits:
 
     def begun(self, starts: Mapping[type[Effect], Sequence[State]]) -> list[_Begun]:
         """Fit all starts of each effect for a few iterations; the best effect comes first."""
-        whole, base = self._before.mean_square, self._before.base
-        least = whole
+        whole = least = self._before.mean_square
         found = list[_Begun]()
         for i, (effect, states) in enumerate(starts.items()):
             self._share = 0.5 + 0.5 * i / len(starts)
@@ -222,13 +230,7 @@ class _JointFits:
             goal = min(self._worth, whole - WORTH_END * (whole - least))
             if least < self._done:
                 goal = min(goal, FORM_RATIO * least + self._done)
-            until = Until(FIRST, goal=goal)
-
-            def begin(
-                own: Simulator, state: State, tick: Callable[[], None], until: Until = until
-            ) -> Fitted:
-                return fit_jointly(own, state, base, until=until, tick=tick)
-
+            begin = partial(self._begin, Until(FIRST, goal=goal))
             fits = [one for one in fit_starts(self._simulator, states, begin, self._alive) if one]
             least = min([least, *map(_error, fits)])
             if fits:
@@ -236,6 +238,11 @@ class _JointFits:
             else:
                 self.warnings.append(f'{effect.name} was not judged: its fits fail on these data')
         return sorted(found, key=lambda one: _error(one.fitted))
+
+    def _begin(
+        self, until: Until, own: Simulator, state: State, tick: Callable[[], None]
+    ) -> Fitted:
+        return fit_jointly(own, state, self._before.base, until=until, tick=tick)
 
     def to_the_end(self, begun: Sequence[_Begun]) -> list[Fitted]:
         """Fit the best candidates to the end; return the candidates that show, the best first."""

@@ -70,7 +70,12 @@ class Multisines(NamedTuple):
     """
     Periods of multisines of all axes at once, at two amplitudes, of two realisations each.
 
-    The smallest amplitude comes first; the voltages are about `v0` [V], shape (axes,).
+    Attributes
+    ----------
+    periods : tuple of PeriodicRecord
+        Smallest amplitude first; their voltages are about `v0`.
+    v0 : ndarray, shape (axes,)
+        [V]
     """
 
     periods: tuple[PeriodicRecord, ...]
@@ -127,8 +132,20 @@ def find_shared_modes(
     """
     Find hysteresis inside the loop of shared modes, if the chains of the axes err more.
 
-    The result is None for a stage free of such hysteresis.  With `tests`, the multisines held out
-    stay out of the last fit, to test its modes.
+    Parameters
+    ----------
+    chains : MultiAxisModel
+    sines : Multisines
+        Of the records.
+    records : sequence of Record
+    progress : callable
+    tests : bool
+        Whether the multisines held out stay out of the last fit, to test its modes.
+
+    Returns
+    -------
+    SharedModesFinding or None
+        None for a stage free of such hysteresis.
     """
     try:
         return _found(chains, sines, records, progress, tests)
@@ -228,7 +245,11 @@ class LawSearch:
     """
     Fits of the laws to periodic records; one record of each group is held out.
 
-    Each group has at least two records; the smallest amplitude comes first.
+    Parameters
+    ----------
+    records : sequence of PeriodicRecord
+        At least two in each group, smallest amplitude first.
+    progress : callable
     """
 
     def __init__(self, records: Sequence[PeriodicRecord], progress: Progress) -> None:

@@ -177,6 +177,10 @@ class Simulator:
             self._added = times, np.array([*of.T, *parts]).T
         return self._added[1]
 
+    def crept(self, state: State) -> Array:
+        """Compute creep from motion before the records in each row; shape (n,)."""
+        return self.added_columns(state)[:, state.offsets.size :] @ state.earlier.ravel()
+
     def bare(self, state: State) -> Array:
         """Compute the rows of H, G and the delay alone; shape (n,)."""
         G, delay, h = self.model.dynamics, self.model.delay, state.hysteresis

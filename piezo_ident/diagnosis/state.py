@@ -85,11 +85,22 @@ class State:
     """
     Fitted quantities: H, the offset of each record, and the effects added.
 
-    `offsets`, shape (records,), are added to the displacement, normalised.  `retuning` holds the
-    coefficients of `retuned`; it is empty if G stays unchanged.  `linear` is another G and delay
-    than the model has.  `law` and `coefficients`, shape (size,), describe H; the law is None if H
-    stays fixed.  `fading` are time constants [s] of creep that continues from earlier motion, and
-    `earlier` its amplitudes at the start of each record, normalised, shape (records, times).
+    Attributes
+    ----------
+    hysteresis : Hysteresis
+    offsets : ndarray, shape (records,)
+        Added to the displacement, normalised.
+    effects : tuple of Added
+    retuning : tuple of float
+        Coefficients of `retuned`; empty if G stays unchanged.
+    linear : (Dynamics, Delay) or None
+        Another G and delay than the model has.
+    law, coefficients : HysteresisLaw or None, ndarray, shape (size,)
+        The law of H, and H in this law; None if H stays fixed.
+    fading : tuple of float
+        Time constants of creep that continues in each record from earlier motion [s].
+    earlier : ndarray, shape (records, times)
+        Amplitudes of this creep at the start of each record, for each time constant, normalised.
     """
 
     hysteresis: Hysteresis

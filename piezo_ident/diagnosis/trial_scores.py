@@ -57,11 +57,18 @@ class Scored:
     """
     One trial of a candidate and its score.
 
-    `coefficients`, shape (c,), are the steps of the amplitudes from the least-squares fit.
-    `error` is the sum of squares of all blocks, held out in spread sets.  It is infinite for an
-    effect that is either on or off if its fitted amplitude is not about one.  `chance` is the
-    largest decrease of the sum of squares of a surrogate, and `visible` the share of the columns
-    that the rest of the model cannot imitate.
+    Attributes
+    ----------
+    effect, trial
+    coefficients : ndarray, shape (c,)
+        Steps of the amplitudes, from the least-squares fit.
+    error : float
+        Sum of squares of all blocks, held out in spread sets.  It is infinite for an effect that
+        is either on or off if its fitted amplitude is not about one.
+    chance : float
+        Largest decrease of the sum of squares of a surrogate.
+    visible : float
+        Share of its columns that the rest of the model cannot imitate.
     """
 
     effect: type[Effect]

@@ -40,12 +40,22 @@ class Findings:
     """
     Judgement in numbers and names.
 
-    `effects` are the effects that were added, in order, and `gains` the mean squares that they
-    explain.  `explainable` is the error to explain, a mean square (`Decision.whole`).  With
-    effects of tests of their own, it is at least the error of the best H without them.  `share` is
-    the part of it that everything added explains, and `left` the error left beyond the noise, rms
-    in % of stroke.  `gain` is the other gain, if it explains the error as well as a refit of H.
-    `set_in` tells whether an effect has set in since the identification.
+    Attributes
+    ----------
+    verdict : str
+    effects, gains : tuple of str, tuple of float
+        Effects that were added, in order, and the mean square that each explains.
+    group : Class or None
+    explainable : float
+        Error to explain, a mean square (`Decision.whole`).  With effects of tests of their own, at
+        least the error of the best H without them.
+    share, left : float
+        Share of the explainable error that everything added explains, and the error left beyond
+        the noise, rms in % of stroke.
+    gain : OtherGain or None
+        The other gain, if it explains the error as well as a refit of H.
+    set_in : bool
+        Whether an effect has set in since the identification.
     """
 
     verdict: str

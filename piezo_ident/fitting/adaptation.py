@@ -139,8 +139,15 @@ class Adaptation:
 
     The result does not depend on the size of the blocks.
 
-    `kind` is the learnt part of the model; the hysteresis includes the gain.  Displacement is
-    `horizon` samples older than the free run that it corrects.  `recalled` is at rest when absent.
+    Parameters
+    ----------
+    model : StageModel
+    kind : {'gain', 'hysteresis'}
+        Learnt part of the model; the hysteresis includes the gain.
+    horizon : int, optional
+        Samples by which displacement is older than the free run that it corrects.
+    recalled : callable, optional
+        See `Recalled`; at rest when absent.
     """
 
     def __init__(
@@ -255,10 +262,16 @@ class Adaptation:
         """
         Run the learnt model freely over the next samples [m], shape (n,).
 
-        `v` and `t` are the voltage [V] and its time [s], `free` is the free run of the model
-        without changes [m], and `measured` the displacement `horizon` samples before each sample
-        [m], NaN if it is missing; shapes (n,).  Nothing is learnt from samples that are not
-        `sound`, as outputs of plays are then unknown.
+        Parameters
+        ----------
+        v, t : ndarray, shape (n,)
+            Voltage [V] and its time [s].
+        free : ndarray, shape (n,)
+            Free run of the model without changes [m].
+        measured : ndarray, shape (n,)
+            Displacement `horizon` samples before each sample [m]; NaN if it is missing.
+        sound : bool, optional
+            Whether to learn from these samples; False while outputs of plays are unknown.
         """
         s = self.model.scaling
         new = self.responses(v, t, free)

@@ -59,9 +59,12 @@ class Cause:
     """
     A part of the stage that changed.
 
-    `part` is 'gain', 'loop' or 'dynamics'.  `value` is the relative change of the gain or of the
-    loop width, and `std` its standard deviation.  For dynamics it is the rms error by their
-    change, in spans: positive for a slower stage.
+    Attributes
+    ----------
+    part : {'gain', 'loop', 'dynamics'}
+    value, std : float
+        Relative change of the gain or of the loop width, and its standard deviation.  For dynamics
+        the rms error by their change, in spans: positive for a slower stage.
     """
 
     part: str
@@ -98,8 +101,13 @@ class Attribution:
     """
     Finds the changed parts of a stage from displacement that comes a horizon later.
 
-    Displacement is `horizon` samples older than the free run.  `recalled` is at rest when absent,
-    see `Recalled`; None leaves the gain and the delay alone.
+    Parameters
+    ----------
+    model : StageModel
+    horizon : int
+        Samples by which displacement is older than the free run.
+    recalled : callable, optional
+        See `Recalled`; at rest when absent.  None leaves the gain and the delay alone.
     """
 
     def __init__(
@@ -122,8 +130,14 @@ class Attribution:
         """
         Take the next samples; all shapes (n,).
 
-        `v` and `t` are the voltage [V] and its time [s], `free` is the free run of the model [m],
-        and `measured` the displacement a horizon before [m], NaN if it is missing.
+        Parameters
+        ----------
+        v, t : ndarray
+            Voltage [V] and its time [s].
+        free : ndarray
+            Free run of the model [m].
+        measured : ndarray
+            Displacement a horizon before [m]; NaN if it is missing.
         """
         self._batch.append((v, t, free, measured))
         if sum(part[0].size for part in self._batch) >= BATCH * self._rate:

@@ -40,9 +40,15 @@ class Fit:
     """
     Result of a fit.
 
-    `loss` is the sum of squared residuals over the samples that count, normalised.  The
-    `equations` are the normal equations at the result, block by block; `iterations` counts the
-    steps.
+    Attributes
+    ----------
+    stage : Stage
+    loss : float
+        Sum of squared residuals over the samples that count, normalised.
+    equations : Equations
+        Normal equations at the result, block by block.
+    iterations : int
+        Number of steps.
     """
 
     stage: Stage
@@ -96,9 +102,20 @@ def fit(
     """
     Fit all parameters of a stage.
 
-    The fit starts at the stage, and keeps its orders, delay, thresholds and time constants.
-    `tick` is called once a step; it may raise to stop the work.  Raises IdentificationError if no
-    sample counts, or the prediction of the start is not finite.
+    Parameters
+    ----------
+    stage : Stage
+        Start of the fit; orders, delay, thresholds and time constants are kept.
+    stretches : sequence of Stretch
+    iterations : int, optional
+        Most steps.
+    tick : callable, optional
+        Called once a step; it may raise to stop the work.
+
+    Raises
+    ------
+    IdentificationError
+        If no sample counts, or the prediction of the start is not finite.
     """
     if not any(s.use.any() for s in stretches):
         raise IdentificationError('no sample is left to fit; hold out less')

@@ -70,14 +70,26 @@ class Stage:
     """
     Parameters of a stage, normalised; G has gain one.
 
-    `coefficients` are those of the law, shape (size,).  `dynamics` is G without its delay
-    (``Dynamics.unit()`` has no free parameter), and `delay` counts samples.  Each record has an
-    entry of `offsets`, shape (records,).  `taus` and `creep` are the time constants of creep [s]
-    and its shares, shapes (k,); `lags` are the distances of each element of creep from rest at the
-    first sample, shape (stretches, k).  `resting` marks stretches that begin with all creep at
-    rest, and `rested` tells whether creep is at rest at the start of a record whose memory is
-    known.  `starts` and `guesses` are the shares m of the memory and their first guesses in the
-    prior, shapes (records, PARTS); guesses of zero are known.
+    Attributes
+    ----------
+    law : HysteresisLaw
+    coefficients : ndarray, shape (size,)
+        Coefficients of the law.
+    dynamics : Dynamics
+        G without its delay; ``Dynamics.unit()`` has no free parameter.
+    delay : int
+        Delay [samples].
+    offsets : ndarray, shape (records,)
+    taus, creep : ndarray, shape (k,)
+        Time constants of creep [s] and their shares.
+    lags : ndarray, shape (stretches, k)
+        Distance of each element of creep from rest at the first sample.
+    resting : ndarray of bool, shape (stretches,)
+        Stretches that begin with all creep at rest.
+    rested : bool
+        Whether creep is at rest at the start of a record whose memory is known.
+    starts, guesses : ndarray, shape (records, PARTS)
+        Shares m of the memory, and their first guesses in the prior; guesses of zero are known.
     """
 
     law: HysteresisLaw

@@ -17,12 +17,22 @@ class Stretch:
     """
     Motion with a mask of the samples that count, and their blocks.
 
-    `u` and `x` are the normalised voltage and displacement, shapes (n,); the simulation uses all
-    of the voltage.  `use` marks the samples that count.  `block` is the number of the block of
-    each sample; it never falls along a stretch.  `rate` is the sampling rate [Hz].  `number` is an
-    index among all stretches, and `record` an index among all records.  `before` holds the earlier
-    voltages of the record that the plays remember, shape (k,); it is empty at the start of a
-    record.
+    Attributes
+    ----------
+    u, x : ndarray, shape (n,)
+        Normalised voltage and displacement.  The simulation uses all of the voltage.
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    block : ndarray of int, shape (n,)
+        Number of the block of each sample; it never falls along a stretch.
+    rate : float
+        Sampling rate [Hz].
+    number : int
+        Index among all stretches.
+    record : int
+        Index of the record among all records.
+    before : ndarray, shape (k,)
+        Earlier voltages of the record that the plays remember; empty at the start of a record.
     """
 
     u: Array

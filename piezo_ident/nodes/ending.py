@@ -25,9 +25,16 @@ class Ending:
     """
     The end of this process.
 
-    A signal sets `is_wanted`; another thread then calls `on_wanted` once.  The process may take
-    the time `patience` to close [s].  `unfinished` is work that the end of the process would cut
-    off; the exit code is then 1.
+    Attributes
+    ----------
+    is_wanted : threading.Event
+        Set by a signal.
+    patience : float
+        Time that the process may take to close after a signal [s].
+    on_wanted : callable
+        Called once, in another thread, after `is_wanted` was set.
+    unfinished : str
+        Work that the end of the process would cut off; the exit code is then 1.
     """
 
     def __init__(self) -> None:

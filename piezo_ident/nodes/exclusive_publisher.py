@@ -40,9 +40,19 @@ class ExclusivePublisher:
     """
     A publisher of blocks that asks for the right to drive before it sends.
 
-    A publisher that `stays` between two drives refuses to drive beside any publisher of another
-    node name.  Otherwise it drives beside a silent publisher, such as an excitation between two
-    programs; that excitation does not start beside this one.  `topic` is the full name.
+    Parameters
+    ----------
+    node : Node
+    topic : str
+    stays : bool, optional
+        Whether the publisher also exists between two drives.  It then refuses to drive beside any
+        publisher of another node name.  Without `stays` it drives beside a silent publisher, such
+        as an excitation between two programs; that excitation does not start beside this one.
+
+    Attributes
+    ----------
+    topic : str
+        Full name of the topic.
     """
 
     def __init__(self, node: Node, topic: str, *, stays: bool = False) -> None:

@@ -263,7 +263,8 @@ class FeedforwardNode(DrivingNode):
         x, faults = self._wanted.take(samples, verdict, resting, self.values['longest'])
         for fault in faults:
             self._faults.note(*fault)
-        self._answered = self._last if is_new else self._answered
+        if is_new:
+            self._answered = self._last
         if (tracker := self._tracker) is not None:
             self._counts['streams'] += is_new
             self._play(tracker.process(x, is_new and self._state == 'tracking'))

@@ -105,9 +105,16 @@ class LabNode(ParameterNode):
         """
         Publish the latched status: a `state` in one word, its progress [%] and a text for people.
 
-        The message is a short form of the text that fits ``ros2 topic echo``: `brief`, a number
-        first, or else the progress and the text.  The part `problems` of the text, or else the
-        whole text, goes to the log as a warning.  `values` are further numbers.
+        The message is a short form of the text that fits ``ros2 topic echo``.
+
+        Parameters
+        ----------
+        brief : str, optional
+            Short form of the text, a number first; default: the progress and the text.
+        problems : str, optional
+            Part of the text that goes to the log as a warning; default: the whole text.
+        **values
+            Further numbers.
         """
         if not brief:
             # a program may be called 3peaks

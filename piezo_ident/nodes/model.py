@@ -287,7 +287,8 @@ class ModelNode(LabNode):
             if one.model is not None and one.error.seconds
         }
         values |= {f'residual_percent{tail}': x for tail, x in errors.items()}
-        brief = f'{" and ".join(errors.values())} % of stroke, live error; {text}' * bool(errors)
+        live = f'{" and ".join(errors.values())} % of stroke, live error; {text}'
+        brief = live if errors else ''
         wrong = '; '.join(filter(None, problems))
         self.report_status(state, 0.0, text, level, brief=brief, problems=wrong, **values)
 

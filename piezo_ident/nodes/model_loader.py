@@ -36,9 +36,16 @@ class ModelLoader(Generic[T]):
     A thread reads the models, because reading YAML and compiling take longer than a block.  If
     several models wait, the thread reads the newest alone.
 
-    The thread calls `prepare` for a model.  The executor of the node then calls `take` for each
-    model in turn, with the prepared model and its source, or None and an error, and `done` after
-    all loaded models.
+    Parameters
+    ----------
+    node : Node
+    prepare : callable
+        Prepares a model for the node; the thread calls it.
+    take : callable
+        Gets the prepared model and its source, or None and an error.  The executor of the node
+        calls it for each model in turn.
+    done : callable
+        Called after `take` for all loaded models.
     """
 
     def __init__(

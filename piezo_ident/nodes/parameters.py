@@ -36,9 +36,21 @@ class Declaration:
     """
     Declaration of one parameter.
 
-    The parameter has the type of its `default`.  The `description` lacks the unit.  The range of a
-    number includes both ends, `low` and `high`.  Without `choices` any text is allowed.  A
-    `read_only` parameter can only be set when the node starts.
+    Attributes
+    ----------
+    name : str
+    default : bool, int, float, str or tuple of str
+        The parameter has the type of its default.
+    description : str
+        Meaning, without the unit.
+    unit : str
+        Empty without a unit.
+    low, high : float, optional
+        Range of a number, both ends included.
+    choices : tuple of str
+        Allowed texts; any text if empty.
+    read_only : bool
+        Whether it can only be set when the node starts.
     """
 
     name: str

@@ -149,7 +149,11 @@ class RawSubscriptions:
     """
     Subscriptions of a recording: serialised messages, with the QoS that publishers offer.
 
-    The `topics` have full names.
+    Parameters
+    ----------
+    node : Node
+    topics : iterable of str
+        Full names.
     """
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:

@@ -33,8 +33,14 @@ class Candidate:
     """
     Fit with a name and its errors on held-out data.
 
-    `blocks` and `kinds` are mean squares, normalised; `kinds` equals `blocks` if no kinds can be
-    held out.  `effects` is the number of effects beyond H, G and the delay.
+    Attributes
+    ----------
+    name : str
+    fit : Fit
+    blocks, kinds : float
+        Mean squares, normalised; `kinds` equals `blocks` if no kinds can be held out.
+    effects : int
+        Number of effects beyond H, G and the delay.
     """
 
     name: str

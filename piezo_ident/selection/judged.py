@@ -22,9 +22,18 @@ class JudgedRun:
     """
     Free run of a model on one piece, with its errors.
 
-    `predicted` is the displacement [m], `use` marks the samples that count, and `held` the samples
-    that no fit of the judged model used; shapes (n,).  `zero` is the known zero of displacement of
-    the record, from that of the model [m].
+    Attributes
+    ----------
+    record : str
+    piece : Piece
+    predicted : ndarray, shape (n,)
+        Displacement [m].
+    use : ndarray of bool, shape (n,)
+        Samples that count.
+    held : ndarray of bool, shape (n,)
+        Samples that no fit of the judged model used.
+    zero : float, optional
+        Known zero of displacement of the record, from that of the model [m].
     """
 
     record: str

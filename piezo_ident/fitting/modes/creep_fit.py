@@ -31,8 +31,12 @@ class SlowMotion(NamedTuple):
     """
     Errors of modes and elements of creep, averaged over blocks, about the mean of each piece.
 
-    `w` are errors and `u` voltages [V], shapes (blocks, axes); `lags` are elements of creep [V],
-    shape (blocks, axes, m).
+    Attributes
+    ----------
+    w, u : ndarray, shape (blocks, axes)
+        Errors and voltages [V].
+    lags : ndarray, shape (blocks, axes, m)
+        Elements of creep [V].
     """
 
     w: Array

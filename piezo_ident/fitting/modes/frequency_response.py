@@ -29,8 +29,13 @@ class LineResponse:
     """
     G at lines of a period.
 
-    The numbers of the `lines`, shape (k,), are multiples of rate / samples, with `samples` a
-    period; `g` has the shape (k, outputs, inputs).
+    Attributes
+    ----------
+    lines : ndarray of int, shape (k,)
+        Numbers of the lines, multiples of rate / samples.
+    samples : int
+        Samples a period.
+    g : ndarray of complex, shape (k, outputs, inputs)
     """
 
     lines: NDArray[np.intp]

@@ -106,8 +106,12 @@ def choose_order(
     """
     Fit models of rising order, and choose by the error on records held out.
 
-    The result has the lowest order of those whose error is within `WORTH` of the least; the
-    mapping holds the error in % of each order that was tried.
+    Returns
+    -------
+    Modal
+        The lowest order of those whose error is within `WORTH` of the least.
+    dict
+        Error in % of each order that was tried.
     """
     response = frequency_response(records)
     # neighbours say nearly the same: enough for the choice

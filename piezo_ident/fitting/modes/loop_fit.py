@@ -44,7 +44,10 @@ class Parameters:
     """
     Which numbers of a model are fitted besides C, D and H, which always are.
 
-    The place of each of them is a number of `KINDS`, a row and a column.
+    Attributes
+    ----------
+    kinds, rows, columns : ndarray of int
+        Place of each of them: a number of `KINDS`, row and column.
     """
 
     kinds: NDArray[np.intp]
@@ -58,8 +61,12 @@ class Parameters:
         """
         Choose the parameters of a model.
 
-        Kinds in `hold` are not fitted, nor is the mixture of motion and voltage, F and G, of the
-        signals `still`.
+        Parameters
+        ----------
+        hold : collection of str
+            Kinds that are not fitted.
+        still : collection of int
+            Signals whose mixture of motion and voltage, F and G, is not fitted.
         """
         arrays = _arrays(model)
         places = [
@@ -138,8 +145,15 @@ def loop_fit(
     """
     Lower the error of a model in free run over periodic records.
 
-    `hold` and `still` are not fitted, see `Parameters.of`.  The modes of the result are stable
-    over its range of levels, which the records often reach.
+    Parameters
+    ----------
+    hold, still : collections
+        Parameters that are not fitted, see `Parameters.of`.
+
+    Returns
+    -------
+    SharedModes
+        Its modes are stable over its range of levels, which the records often reach.
     """
     model = _ranged(model, records)
     with ThreadPoolExecutor(WORKERS) as pool:

@@ -43,11 +43,24 @@ class PeriodicRecord:
     """
     Whole periods of a stage in steady state.
 
-    Records of one amplitude share a `group`; `rate` is in Hz.  `u` and `y` are voltages and
-    displacements, shapes (periods, samples, inputs) and (periods, samples, outputs).  The mean of
-    each period is taken off y.  NaN in y marks a lost reading: readings of the other periods
-    replace it, or a straight line.  `sound` is False for lost readings, which count in no error.
-    `weight` is the weight in a fit.
+    Parameters
+    ----------
+    name : str
+        Name in messages.
+    group : str
+        Records of one amplitude share it.
+    rate : float
+        [Hz]
+    u, y : ndarray, shape (periods, samples, inputs) and (periods, samples, outputs)
+        Voltages and displacements.  The mean of each period is taken off y.  NaN in y marks a lost
+        reading: readings of the other periods replace it, or a straight line.
+    weight : float
+        Weight in a fit.
+
+    Attributes
+    ----------
+    sound : ndarray of bool, shape of y
+        False for lost readings, which count in no error.
     """
 
     name: str
@@ -141,12 +154,18 @@ def percent_of(records: Sequence[PeriodicRecord], answers: Sequence[Array]) -> f
 
 def periods_of(records: Sequence[Record]) -> tuple[tuple[PeriodicRecord, ...], Array]:
     """
-    Find the periods in which all axes move at once, and the mean voltages v0 [V], shape (inputs,).
+    Find the periods in which all axes move at once.
 
-    The stage settles in the first period, which is left out of three or more.  A piece without
-    segments is one segment with the name of its record.  Segments named alike but for a number at
-    the end are one group.  Periods of the most frequent length are taken.  The group of the
-    smallest voltages comes first; the voltages are about v0.
+    The stage settles in the first period, which is left out of three or more.  A piece
+    without segments is one segment with the name of its record.  Segments named alike but for a
+    number at the end are one group.  Periods of the most frequent length are taken.
+
+    Returns
+    -------
+    tuple of PeriodicRecord
+        Group of the smallest voltages first; the voltages are about `v0`.
+    v0 : ndarray, shape (inputs,)
+        Mean of the voltages [V].
     """
     records = [without_faults(record) for record in records]
     found, rate = [], records[0].pieces[0].sample_rate

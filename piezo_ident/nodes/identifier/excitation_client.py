@@ -51,8 +51,16 @@ class ExcitationClient:
     """
     Plays one program of the excitation at a time.
 
-    All calls return at once; `poll` looks for responses.  `streams` returns the present `Streams`,
-    `missing` the topics without a publisher, as text.
+    All calls return at once; `poll` looks for responses.
+
+    Parameters
+    ----------
+    node : Node
+        Gets the clients and the subscription.
+    streams : callable
+        Returns the present `Streams`.
+    missing : callable
+        Returns the topics without a publisher, as text; '' if all have one.
     """
 
     def __init__(
@@ -121,11 +129,19 @@ class ExcitationClient:
         begin: Callable[[], None] | None = None,
     ) -> None:
         """
-        Begin a run of a program, for the excitation's parameter ``program``.
+        Begin a run.
 
-        The excitation and the stage may be silent for at most `limit` [s].  `begin` is called when
-        the excitation has accepted the start.  `ended` is called once, except after `stop`: with
-        None when the program was captured to its end, else with the reason.
+        Parameters
+        ----------
+        program : str
+            For the excitation's parameter ``program``.
+        limit : float
+            Longest silence of the excitation or the stage [s].
+        ended : callable
+            Called once: with None when the program was captured to its end, else with the reason.
+            Not called after `stop`.
+        begin : callable, optional
+            Called when the excitation has accepted the start.
         """
         self._program, self._limit = program, limit
         self._begin, self._ended = begin or _nothing, ended

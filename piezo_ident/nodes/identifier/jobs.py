@@ -77,9 +77,16 @@ class Outcome:
     """
     Result of a job, as the node publishes it.
 
-    The `message` is one line for people, `brief` the same in few words, a number first, and
-    `figures` are its numbers.  The `report` is JSON, the new `model` YAML; both are empty without
-    one.  `warnings` counts warnings, and faults of the data, in the report.
+    Attributes
+    ----------
+    message, brief : str
+        One line for people, and the same in few words, a number first.
+    figures : mapping of str to str
+        Numbers of the message.
+    report, model : str
+        JSON, and the new model as YAML; empty without one.
+    warnings : int
+        Number of warnings, and of faults of the data, in the report.
     """
 
     message: str = ''
