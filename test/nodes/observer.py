@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import dropwhile
 import threading
 import time
 from typing import Any
@@ -252,10 +253,18 @@ class Observer:
     def finish(self, service: str, *states: str, timeout: float = WORK) -> dict[str, str]:
         """Call a service, and return the status in which its node ends what that began."""
         name = service.rpartition('/')[0]
-        since = len(self.statuses(name))
+        before, since = self.status(name)['state'], len(self.statuses(name))
         accepted, reason = self.call(service)
         assert accepted, reason
-        return self.until(name, *(states or ENDS), since=since, timeout=timeout)
+        wanted = states or ENDS
+
+        def ends() -> list[dict[str, str]]:
+            # a node repeats its status each second, also while the call is on its way
+            begun = dropwhile(lambda s: s['state'] == before, self.statuses(name)[since:])
+            return [s for s in begun if s['state'] in wanted]
+
+        self.wait(ends, f'{name} to be {" or ".join(wanted)}', timeout)
+        return ends()[0]
 
     # acting
 
