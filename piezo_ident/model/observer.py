@@ -16,7 +16,8 @@ the displacement is the free run plus
   so averaging over time does not reduce it.
 
 A Kalman filter follows o, d and m by the means of groups of samples.  `estimate` is the free run
-plus offset and creep, without m: the error of the model must stay visible.
+plus offset and creep, without m: the error of the model must stay visible.  Its claimed variance
+contains the mean square of m over the last few strokes of the voltage.
 
 The gain is followed on request.  A changed gain adds gamma x, with the free run x about the zero
 of the model and a random walk gamma.  Only motion distinguishes a gain from an offset.  The
@@ -231,6 +232,7 @@ class Observer:
                 P[b, -3, -3] = law.numbers[kernel.DRIFT_VAR]
         now = np.zeros(kernel.PLACES)
         now[kernel.SCALE], now[kernel.READING] = 1.0, np.nan
+        now[kernel.MISFIT] = law.numbers[kernel.ERROR]
         now[kernel.IDLE] = self._gain * law.numbers[kernel.GAIN_SIZE]
         x, weight, group = np.zeros((count, n)), np.zeros(count), np.full((2, self._group), np.nan)
         self._state = kernel.State(x, P, weight, self._row.copy(), group, np.zeros(c), now)

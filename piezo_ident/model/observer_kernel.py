@@ -40,8 +40,8 @@ SEEN, SUM_E, SUM_EE, SUM_X, SUM_XX, SUM_XE = range(23, 29)
 # t is zero now.  Behind them the drift and its standard deviation
 GROUPS, SUM_W, SUM_T, SUM_TT, SUM_G, SUM_TG, DRIFT, DRIFT_STD = range(29, 37)
 # whether the free run has moved since the reading changed last; WAITING, time whose drift of the
-# gain waits for motion [s]
-STUCK_NOW, WAITING, PLACES = range(37, 40)
+# gain waits for motion [s]; ALONG, share by which the path of a group renews averages along it
+STUCK_NOW, WAITING, ALONG, PLACES = range(37, 41)
 # places in `Law.numbers`; STEP is the time of a group [s], FADE that of the fading sums [groups],
 # DRIFT_VAR the variance of the drift of the gain, zero if it is not followed
 NOISE, ERROR, LENGTH, WALK, GATE, GROWTH, LAST, REACH, GAIN_WALK, GAIN_SIZE, STEP, FADE = range(12)
@@ -113,6 +113,7 @@ def _let_time_pass(law: Law, s: State) -> None:
     numbers, now = law.numbers, s.now
     hypotheses, n = s.x.shape
     phi = np.exp(-now[PATH] / numbers[LENGTH])
+    now[ALONG] = 1.0 - phi ** (1.0 / STROKES)
     if numbers[DRIFT_VAR] > 0.0:
         _let_gain_drift(law, s, 1.0 - phi * phi)
     for b in range(hypotheses):
@@ -128,10 +129,9 @@ def _let_time_pass(law: Law, s: State) -> None:
             s.P[b, n - 3, n - 3] += numbers[DRIFT_VAR] * (1.0 - law.kept[n - 3] ** 2)
     if _has_gain(law, s):
         # time makes the gain less certain, and this variance counts along the path only
-        share = 1.0 - phi ** (1.0 / STROKES)
         d = now[FREE] - now[MEAN_X]
-        now[MEAN_X] += share * d
-        now[VAR_X] = (1.0 - share) * (now[VAR_X] + share * d * d)
+        now[MEAN_X] += now[ALONG] * d
+        now[VAR_X] = (1.0 - now[ALONG]) * (now[VAR_X] + now[ALONG] * d * d)
         idle = min(now[IDLE] + numbers[GAIN_WALK], numbers[GAIN_SIZE])
         now[IDLE] = idle * phi * phi
         for b in range(hypotheses):
@@ -246,9 +246,9 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
             for j in range(n):
                 s.P[b, i, j] -= shared[i] * shared[j] / power
         s.weight[b] -= 0.5 * (np.log(power) + min(off * off / power, numbers[GATE]))
-    # running mean square of m
+    # mean square of m over the last few strokes; at rest m is one value again and again
     m = s.x[int(np.argmax(s.weight)), -1]
-    now[MISFIT] += numbers[GROWTH] * (m * m - now[MISFIT])
+    now[MISFIT] += now[ALONG] * (m * m - now[MISFIT])
     s.weight[:] = np.maximum(s.weight - s.weight.max(), FAINT)
 
 
@@ -292,7 +292,7 @@ def tell(law: Law, s: State) -> None:
     if law.numbers[DRIFT_VAR] > 0.0:
         now[DRIFT], now[DRIFT_STD] = drift, np.sqrt(max(drifts - drift * drift, 0.0))
     now[VAR] = max(whole - (offset + creep) ** 2, 0.0)
-    now[VAR] += max(now[SCALE] * law.numbers[ERROR], now[MISFIT])
+    now[VAR] += now[MISFIT]
 
 
 @ordered_kernel

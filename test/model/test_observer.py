@@ -489,3 +489,21 @@ def test_a_step_of_the_zero_is_accepted_at_once_and_a_gain_is_none():
         late = slice(cut + 900, n)
         seen = observer.process(v[late], free[late], measured[late])
         assert np.abs(seen.estimate - truth[late])[5:].max() < 1e-4 * SPAN
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_claim_follows_the_error_of_the_model_and_rest_does_not_change_it(seed):
+    # the model expects to err by 1 %; it errs by a tenth to a third of that
+    model, rng = creeping(), np.random.default_rng(seed)
+    h = model.hysteresis
+    weights = h.weights * (1.0 + 0.05 * rng.standard_normal(h.weights.size))
+    stage = replace(model, hysteresis=replace(h, weights=weights))
+    t = np.arange(8000) / SLOW_RATE
+    lines = sum(np.cos(2 * np.pi * f * t + p) for f, p in ((1.3, 0.0), (2.9, 1.0), (7.1, 4.0)))
+    fade = np.minimum(t, 1.0)
+    v = np.append(fade * (5.0 - 1.6 * lines), np.full(4000, 5.0 - 1.6 * lines[-1]))
+    y = stage.simulate(v)
+    seen = observe(model, Piece(v, with_noise(y, 1e-5 * SPAN), SLOW_RATE))
+    late = slice(4000, 8000)
+    assert 0.4 < rms((seen.estimate - y)[late]) / rms(seen.std[late]) < 1.2
+    assert seen.std[-1] == pytest.approx(seen.std[7999], rel=0.3)
