@@ -424,7 +424,7 @@ def main() -> int:
     for what, n in attack.counts.items():
         result = 'all six nodes stay up, answer, and report what they refused'
         if what == 'service calls':
-            result += f'; {rate:.0f} calls a second by four clients'
+            result = f'the same, at {rate:.0f} calls a second by four clients'
         rows.append((f'graph under attack: {what}', f'{n:,}', result))
     what = 'graph under attack: `applied_voltage` under all of these'
     result = 'limits and slew kept in every one'

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import json
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import subprocess
@@ -36,6 +37,8 @@ ROOT = HERE.parents[2]
 sys.path[:0] = [str(HERE.parent), *(str(ROOT / x) for x in ('test', 'test/nodes', 'examples'))]
 from course import PROGRAM
 
+#: number in the text of a result
+NUMBER = r'\d+(?:\.\d+)?'
 PROFILES = ROOT / 'config/fastdds_two_hosts.xml'
 SETTINGS = {'max_order': 6, 'swarm_iterations': 20_000, 'nice': 0}
 #: what a run may take, and what a busy machine may add to the start of a node [s]
@@ -341,6 +344,16 @@ def _result(outcome: Outcome, perfect: str) -> str:
     return f'{arrived}; {model}{reason}'
 
 
+def _pooled(results: Counter[str]) -> str:
+    """Join the results of all runs; results that differ by numbers alone share their words."""
+    texts = [*results.elements()]
+    if len({re.sub(NUMBER, '', text) for text in texts}) > 1:
+        return '; '.join(f'{n} x {text}' for text, n in results.items())
+    columns = zip(*(re.findall(NUMBER, text) for text in texts), strict=True)
+    values = iter([' / '.join(c if len({*c}) > 1 else c[:1]) for c in columns])
+    return f'{len(texts)} x {re.sub(NUMBER, lambda _: next(values), texts[0])}'
+
+
 def main() -> int:
     """Run all of it, and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
@@ -369,12 +382,11 @@ def main() -> int:
             text = _result(o, perfect)
             results[text] += 1
             print(f'{percent} % lost, {down:g} s down: {text}; {o.dropped} packets, {o.seconds} s')
-        what = f'{percent} % of the packets dropped both ways'
-        what = f'the link down for {down:g} s during the program' if down else what
+        what = f'two hosts, packets dropped both ways: {percent} %'
+        what = f'two hosts: the link down for {down:g} s during the program' if down else what
         dropped = sum(o.dropped for o in outcomes)
-        how_often = f'{len(outcomes)} runs, {dropped} packets dropped{crowd()}'
-        result = '; '.join(f'{n} x {text}' for text, n in results.items())
-        rows.append((f'two hosts: {what}', how_often, result))
+        how_often = f'{len(outcomes)} runs, {dropped} packets{" dropped" if down else ""}{crowd()}'
+        rows.append((what, how_often, _pooled(results)))
     kept, open_ = seen_from(''), seen_from('SUBNET')
     print(kept, open_)
     apart = kept == {'a': ['/host0/stage'], 'b': ['/host1/stage']}
