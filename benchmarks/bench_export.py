@@ -41,7 +41,7 @@ LOOP(drive_NAME, NAME_feedforward, NAME_feedforward_reset, NAME_feedforward_step
 #undef LOOP
 """
 #: shipped stages by the names of their headers
-STAGES = {'paper': "the paper's stage", 'effects': 'the same with creep and rate dependence'}
+STAGES = {'paper': 'paper', 'effects': 'paper, creep, rate dependence'}
 VECTOR = np.ctypeslib.ndpointer(np.float64, flags='C')
 
 

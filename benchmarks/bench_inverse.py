@@ -50,7 +50,7 @@ def of_law(name: LawName, plain: StageModel) -> StageModel:
 def models() -> dict[str, StageModel]:
     """Return what is inverted, by what it is."""
     plain = pi.SimulatedStage.load('paper').model
-    found = {f'H of the law `{name}`, {PLAYS} plays': of_law(name, plain) for name in LAWS}
+    found = {f'law `{name}`, {PLAYS} plays': of_law(name, plain) for name in LAWS}
     with_effects = replace(plain, effects=EFFECTS)
     return {
         "the paper's stage": plain,

@@ -61,10 +61,10 @@ TEXT = """\
 This page gives the errors of the live model on stages that change while they run
 (`make stays-right`).
 
-Each of {stages} simulated stages follows laws that the model does not have. The live model
+Each of {stages} simulated stages follows laws that the model lacks. The live model
 was built without these stages. A stage was identified from one record and diagnosed on another.
 Then it scanned {low:g} to {high:g} V at {lines:g} Hz, along a triangle with round corners.
-One thing about the stage changed {at:g} s later, or before the scan:
+One thing changed {at:g} s later, or before the scan:
 
 - **creep amid motion**: the stage was at the highest voltage for ten seconds, until half a second
   before the scan;
@@ -98,15 +98,13 @@ columns of the first table are ratios to the best of the last four ways.
 
 ## Without a sensor
 
-The sensor is cut off {rest:g} s after the change. The columns are the error over the next 1 s and
-10 s.
+The sensor is cut off {rest:g} s after the change. Columns: error over the next 1 s and 10 s.
 
 {cut}
 
 ## The claimed deviations
 
-How often the error lies within {nine} standard deviations that the observer claims, in %: nine of
-ten errors of a normal law do.
+Share of the errors within {nine} claimed standard deviations, in %: 90 % for a normal law.
 
 {claims}
 

@@ -57,7 +57,7 @@ TEXT = """\
 # How near a stage comes to a wanted motion
 
 This page gives the tracking errors of a stage without a controller, under the inverse of a model
-(`make track`). Each simulated stage follows laws that the model does not have. Its sensor
+(`make track`). Each simulated stage follows laws that the model lacks. Its sensor
 has the steps of its converter, up to 0.04 % here. The stage was identified from one record and
 diagnosed on another, with an undeclared effect. Then it had to follow {motions} motions.
 
@@ -67,7 +67,7 @@ diagnosed on another, with an undeclared effect. Then it had to follow {motions}
 
 - **scaled voltage**: the voltage in proportion to the wanted motion, as without a model;
 - **identified**: `pi.invert` of the model from `pi.identify`;
-- **refined**: `pi.invert` of the model from `pi.diagnose`, which has the effect that was found;
+- **refined**: `pi.invert` of the model from `pi.diagnose`, with the effect that was found;
 - **after {repetitions} repetitions**: the best of the run above and {repetitions} more, each
   corrected by `pi.Learning`.
 

@@ -83,7 +83,7 @@ TEXT = """\
 # A raster of a simulated scanner
 
 This page shows how well the raster of a simulated scanner is predicted and tracked
-(`make study-xy`). The model does not have the laws of the scanner. The first axis is a Preisach
+(`make study-xy`). The model lacks the laws of the scanner. The first axis is a Preisach
 operator with an uneven density and a mode at 190 Hz. The second axis obeys the law of Bouc and
 Wen, has a mode at 240 Hz and creeps by {creep:.1f} % a decade. Either axis moves the other by
 {cross:g} %, through its own mode and one of the guide at 310 Hz. The rate is {rate:g} kHz; the

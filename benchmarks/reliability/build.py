@@ -51,8 +51,8 @@ TAIL = """
 Whatever arrives on `voltage`, every voltage that is *applied* is a number within the limits and no
 further from the voltage before than the slew allows. Where limits are moved, the voltage goes back
 into them at the slew. Silence ends at rest by a ramp, a new stream is joined by a ramp, a second
-publisher moves nothing. `benchmarks/reliability/safety.py` has the property as code. It holds
-while the process that drives the amplifier lives ([My driver](driver.md)).
+publisher moves nothing. `benchmarks/reliability/safety.py` is the property as code. It holds while
+the process of the amplifier lives ([My driver](driver.md)).
 
 ## Damaged files and kills
 
