@@ -5,9 +5,10 @@
 Export a model as a C header: prediction and feed-forward, sample by sample.
 
 Each operator has its C code beside its Python loop (`piezo_ident.operators.c_code.CCode`).  A
-header joins this code in the order of the chain.  The feed-forward uses the same code: with known
-memory, the output of all operators in front of G is a function of the next voltage, which the
-feed-forward solves for the voltage.  `piezo_ident.control.linear_inverse` inverts G and its delay.
+header joins this code in the order of the chain.  The feed-forward uses the same code.  With known
+memory, the output of the operators in front of G is a function of the next voltage.  The
+feed-forward solves this function for the voltage.  `piezo_ident.control.linear_inverse` inverts G
+and its delay.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from piezo_ident.model.stage_model import StageModel
 FAR = 100.0
 #: width of a line of numbers or words [characters]
 WIDTH = 88
-#: reason of a header without a feed-forward, if the user wants none
+#: reason for the missing feed-forward of a header, if the user does not want it
 NOT_WANTED = 'it was not asked for'
 
 
@@ -86,7 +87,7 @@ def export_c(
     slew : float, optional
         Largest speed of the voltage of the feed-forward [V/s].
     preview : int, optional
-        Largest number of future samples of the motion; by default all that are useful.
+        Largest number of future samples of the motion; by default every useful sample.
     title : str, optional
         First line of the header.
     feedforward : bool, optional
@@ -169,7 +170,7 @@ def _feedforward(
     front, _, back = links_of(model)
     part = 'front'
     if lines:
-        # the changed links are functions beside those of the prediction
+        # the changed links become further functions beside the functions of the prediction
         part = 'rising'
         front = LinkGroup([replace(link, tag=f'{part}_{link.tag}') for link in front.links])
     in_front = [link.name for link in front.links]
@@ -177,7 +178,7 @@ def _feedforward(
     Q = whole = linear_inverse(replace(model, effects=rest))
     if preview is not None:
         Q = Q.shortened(preview)
-    # an effect that reads the command has no inverse, as the command is not known yet
+    # an effect that reads the command cannot be inverted: the command is still unknown
     undone = [link for link in back.links if 'v' not in link.signals_in(link.code.step)]
     inverted = LinkGroup([x for x in undone if x.effect and not is_filter(type(x.effect))])
     low, high, most = kept

@@ -45,7 +45,7 @@ def export_modes(
     title : str, optional
         First line of the header.
     feedforward : bool, optional
-        Has no effect: the header has no feed-forward.
+        Ignored, because a header of shared modes has no feed-forward.
     **drive
         Settings of a feed-forward, which are refused.
 

@@ -18,7 +18,7 @@ for the theta_j that a group informs about, and never below the information of t
     L <- A L A + (1 - A^2) L0 + f f' / R,      A_j^2 = 1 - (1 - mu) s_j / (s_j + e R)
 
 L is the information, L0 the diagonal information of the prior, R the variance of a measurement.
-s_j is f_j^2 / L0_jj, mu follows from `MEMORY`, and e is `TELLS` of the kernel.  A stage at rest
+s_j is f_j^2 / L0_jj.  mu follows from `MEMORY`.  e is `TELLS` of the kernel.  A stage at rest
 informs about no theta_j, so theta stays.  Half-spaces bound theta: the weights of plays stay
 positive, H rises, and each change has a plausible size.  A theta outside of a half-space moves
 onto it along L^-1.  Measurements far from the prediction are refused for `PATIENCE`, in which the
@@ -47,8 +47,8 @@ from piezo_ident.operators.hysteresis import Hysteresis
 
 #: learnt part of the model
 Learns = Literal['off', 'gain', 'hysteresis']
-#: turns a model into a run that has seen the voltage so far; None if modes that axes share predict
-#: instead of the model, which then has scaling and known errors alone
+#: turns a model into a run that has seen the voltage so far.  The value is None if modes that axes
+#: share predict instead of the model; the model then has scaling and known errors alone
 Recalled: TypeAlias = Callable[[StageModel], Stream] | None
 
 #: time over which samples are averaged to one measurement [s]
@@ -230,7 +230,7 @@ class Adaptation:
         return found
 
     def _weights(self, learnt: dict[str, float]) -> Array | None:
-        """Return the relative change of each weight of a play, without that of the gain."""
+        """Return the relative change of each weight of a play, without the change of the gain."""
         hats = [x for name, x in learnt.items() if name.startswith('weights')]
         r = self.model.hysteresis.thresholds
         return np.interp(r, np.linspace(r[0], r[-1], len(hats)), hats) if hats else None

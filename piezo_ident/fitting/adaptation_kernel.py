@@ -72,7 +72,7 @@ def _constrain(theta: Array, P: Array, halves: Array, way: Array) -> None:
         share = worst / _times(P, halves[at, :n], way) * (1.0 + 1e-9)
         for i in range(n):
             theta[i] -= way[i] * share
-    # no allowed point was found: go halfway back to the model without changes
+    # some half-space is still violated: go halfway back to the unchanged model
     for i in range(n):
         theta[i] *= 0.5
 

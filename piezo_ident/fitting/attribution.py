@@ -45,8 +45,8 @@ BATCH = 0.1
 SURE = 3.0
 #: least reduction of the squared error by one more part, as a share of the whole (taste)
 FAINT = 2e-3
-#: distance from the median of a block, in median deviations, beyond which an error is left out:
-#: twelve standard deviations of a normal law (taste)
+#: largest distance of an error from the median of its block, in median deviations.  An error
+#: beyond is left out.  18 are twelve standard deviations of a normal law (taste)
 WILD = 18.0
 
 #: rows of the regression by part; the last row is the error
@@ -84,7 +84,7 @@ def percent_change(value: float, std: float) -> str:
 
 
 def slower(model: StageModel) -> StageModel | None:
-    """Slow the poles of G by `SLOWER`; None if all are real and at most zero."""
+    """Slow the poles of G by `SLOWER`; return None if all poles are real and at most zero."""
     G = model.dynamics
     poles = G.poles
     # a pole on the negative real axis has no frequency
@@ -107,7 +107,7 @@ class Attribution:
     horizon : int
         Samples by which displacement is older than the free run.
     recalled : callable, optional
-        See `Recalled`; at rest when absent.  None leaves the gain and the delay alone.
+        See `Recalled`; at rest when absent.  With None, only gain and delay can be changed parts.
     """
 
     def __init__(

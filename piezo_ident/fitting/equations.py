@@ -55,7 +55,7 @@ class Equations:
 
         Blocks with the same number in `sets`, shape (n_b,), are left out together.  Blocks with
         the number -1 stay in every fit.  The prior, shape (p, p), is the information before the
-        fit.  Bounds and `rising` are those of `bounded_step`.
+        fit.  `bounded_step` describes the bounds and `rising`.
         """
         A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
         errors = self.s.copy()

@@ -23,15 +23,16 @@ from piezo_ident.fitting.equations import bounded_step, Equations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
-#: damping as a share of the energy of each column: the first, its factors after a failed and after
-#: a good step, its smallest value, and the value that ends the fit
+#: damping as a share of the energy of each column: the first damping, the factors after a failed
+#: and after a good step, the smallest damping, and the damping that ends the fit
 DAMPING, WORSE, BETTER, LEAST, MOST = 1e-4, 5.0, 0.1, 1e-9, 1e6
 #: the fit ends if a step lowers the loss, or promises to, by less than this share
 SLOW = 1e-4
 #: independent observations in a block, as neighbouring residuals are alike (taste)
 OBSERVATIONS = 5.0
-#: most passes over the weight of the prior, and the share of the loss at which they end; smallest
-#: share of the loss that a step may promise, and smallest loss: what is below is rounding
+#: most passes over the weight of the prior; the passes end once one of them leaves more than this
+#: share of the loss.  Smallest share of the loss that a step may promise, and smallest loss: a
+#: smaller loss is rounding
 PASSES, ALIKE, EXACT, TINY = 10, 0.9, 1e-12, 1e-290
 
 
@@ -180,8 +181,8 @@ def _solved(here: _Point, equations: Equations, damping: float) -> tuple[Array, 
     """
     Solve the linearised equations; return the step and the loss that it promises.
 
-    The prior counts like one observation with the rms residual that is left, so the equations are
-    solved again with the residual that they promise.
+    The prior counts like one observation with the rms of the remaining residual.  The equations
+    promise another residual, so they are solved again with the promised residual.
     """
     stage, left = here.stage, here.loss
     values, (lower, upper) = stage.values, stage.bounds

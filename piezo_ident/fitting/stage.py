@@ -54,12 +54,12 @@ PARTS = 6
 LEAST_SLOPE = 0.05
 #: largest share of one element of creep: piezo ceramics creep by 1 to 5 % of a step in all
 MOST_CREEP = 0.1
-#: prior rms of an element of creep, of a lag of creep as a share of the range, and of a share of
-#: the memory at a start around its guess
+#: prior rms of three parameters: an element of creep, a lag of creep as a share of the range, and
+#: a share of the memory at a start around its guess
 CREEP_SPREAD, LAG_SPREAD, START_SPREAD = 0.02, 0.5, 0.5
-#: prior rms of the density of H, and of the changes over the range of this density and of the
-#: slope behind a turning point.  The even density that makes the whole stroke is 2 (taste:
-#: a quarter of it, and a third of the mean slope)
+#: prior rms of three quantities: the density of H, the change of the density over the range, and
+#: the change of the slope behind a turning point over the range.  The even density that makes the
+#: whole stroke is 2 (taste: a quarter of it, and a third of the mean slope)
 DENSITY_SPREAD, DENSITY_CHANGE, SLOPE_CHANGE = 2.0, 0.5, 0.3
 #: step of the finite difference over a share of the memory
 STEP = 1e-3
@@ -209,7 +209,7 @@ class Stage:
         """
         Rows, shape (k, size), and their smallest products with a step of H for which H rises.
 
-        None if the path has no lags: `bounds` then suffice.
+        A law without lags along the path gives None, because `bounds` suffice.
         """
         if not self.law.lags:
             return None

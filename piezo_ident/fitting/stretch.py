@@ -77,8 +77,8 @@ def remembered(u: Array) -> Array:
     """
     Reduce u to its first value, the turning points that plays remember, and its last value.
 
-    The result has shape (k,).  Of four values in a row, the inner two are dropped if they lie
-    between the outer two: plays do not remember them (wiping out).
+    The result has shape (k,).  Plays forget the inner two of four values in a row if the inner
+    two lie between the outer two (wiping out).
 
     Examples
     --------

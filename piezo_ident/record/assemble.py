@@ -5,7 +5,7 @@
 Make a record of raw columns, and handle every fault of measured data the same way for all formats.
 
 Gaps, restarts and changes of the sampling rate split the record.  Repeated rows are dropped.
-Samples without a number are cut out; the voltage stays if only the displacement is no number.  A
+NaN and infinite samples are cut out; if the displacement alone is affected, the voltage stays.  A
 `Fault` reports each of these faults.  Data that need a guess are refused with the remedy.
 """
 

@@ -28,8 +28,8 @@ from piezo_ident.record.record import Segment
 
 #: samples in a block by default
 BLOCK_SIZE = 100
-#: labels of voltages without a command: a driver holds the last voltage during a gap, and ramps
-#: to rest when no command comes
+#: labels of voltages that the driver chose: it holds the last voltage during a gap, and ramps to
+#: rest when the commands end
 HELD, RAMPED = 'hold:gap', 'ramp:silence'
 #: share of a sample by which times of ticks may be rounded
 ROUNDING = 1e-5

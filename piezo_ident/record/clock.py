@@ -96,7 +96,7 @@ def time_stamps(sample_rate: float, start_time: float, start: int, stop: int) ->
     Return the times of samples `start` to ``stop - 1`` [s].
 
     The times are ``k / sample_rate`` in one division if the first sample lies on a tick of the
-    sample clock: two streams of one clock then join on equal numbers.
+    sample clock.  Two streams of one clock then have equal numbers, and join.
     """
     first = round(start_time * sample_rate)
     t = np.arange(start, stop, dtype=np.float64)

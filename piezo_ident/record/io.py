@@ -158,7 +158,7 @@ def _doubts(record: Record, table: RecordTable, options: ReadOptions) -> Iterato
             unit = table.units.get('t', 's')
             finer = {'ms': 'us', 'us': 'ns'}.get(unit, 'ms')
             other = finer if kind == 'slow' else 's' * (unit != 's')
-            # a unit without a number must not contradict the header
+            # a unit with a number overrides the header; a plain unit must agree with it
             other = f'1{other}' if other and 't' in table.units else other
             where += f' with t in {unit}'
             cure = 'is the time unit right?' + (other and f' else add --time-unit {other}')

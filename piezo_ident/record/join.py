@@ -237,8 +237,8 @@ def _in_step(
     """
     Return the rows that the streams share, by runs of the sample clock.
 
-    Return None unless all streams have the same runs and no repeated block.  Hours of samples are
-    then joined without a table of partners.
+    Return None if the runs of the streams differ, or a block is repeated.  Equal runs join hours
+    of samples without a table of partners.
     """
     begins, came = {}, {}
     for name, t in times.items():

@@ -182,7 +182,7 @@ def name_and_unit(name: str) -> tuple[str, str]:
     >>> [name_and_unit(x) for x in ('t [s]', 'Time (ms)', 'y/\u00b5m', 'position_um', 'drive')]
     [('t', 's'), ('Time', 'ms'), ('y', 'um'), ('position', 'um'), ('drive', '')]
     """
-    # the name of a field without its struct, or of a channel without its group
+    # keep the name of the field or channel, and drop the name of its struct or group
     name = re.sub(PATH, '', name.strip())
     match = _NAMED.fullmatch(name)
     if not match:

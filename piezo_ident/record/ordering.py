@@ -102,7 +102,7 @@ def _stretches(
     Returns the rows that stay, None for all, the first row of each epoch, and times of repeats.
     """
     t = table.t
-    # without a dropped row, rows are their own numbers and need no table
+    # until a row is dropped, row numbers need no table
     rows: Integers | None = None
     known = t  # t[rows], so that a look-up copies nothing
     size, begin = 0, 0

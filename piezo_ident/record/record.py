@@ -28,7 +28,7 @@ from piezo_ident.record.clock import time_stamps
 #: kinds of segments in programs; samples with other labels count as unlabelled
 KINDS: tuple[str, ...] = ('step', 'settle', 'noise', 'triangle', 'sine', 'hold', 'staircase')
 KINDS += ('multisine', 'ramp', 'idle')
-#: what to give as further channels
+#: advice on the form of further channels
 NAMED = "give an array by name, as in {'v_b': array}"
 
 

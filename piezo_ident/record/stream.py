@@ -30,8 +30,8 @@ class BlockStream:
     """
     All `n` samples of one topic so far; added blocks never change, so copies share them.
 
-    A `spooled` stream moves its samples to temporary files whenever there are more than `SPOOLED`;
-    it can be neither copied nor shortened.  DataError if there is no room for these files.
+    A `spooled` stream moves its samples to temporary files whenever there are more than `SPOOLED`.
+    It cannot be copied, and cannot be shortened.  DataError if there is no room for these files.
     """
 
     def __init__(self, *, spooled: bool = False) -> None:

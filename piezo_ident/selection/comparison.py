@@ -6,8 +6,8 @@ Compare fits by their prediction of held-out data.
 
 The error of a candidate is the geometric mean of two mean squares.  One mean square holds out
 interleaved blocks, the other whole kinds of motion.  Blocks alone would prefer an H that follows
-known motion and errs on other motion; kinds alone are too few.  Of candidates with alike errors,
-the candidate with the fewest parameters wins.
+known motion and errs on other motion; kinds alone are too few.  If errors are alike, the candidate
+with the fewest parameters wins.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
-    # a prediction works without a fit, hence without scipy.signal
+    # a prediction needs no fit, so it does not import scipy.signal
     from piezo_ident.fitting.free_run import Fit
 
 
@@ -33,7 +33,7 @@ class JudgedRun:
     held : ndarray of bool, shape (n,)
         Samples that no fit of the judged model used.
     zero : float, optional
-        Known zero of displacement of the record, from that of the model [m].
+        Known zero of displacement of the record, relative to the zero of the model [m].
     """
 
     record: str
@@ -75,10 +75,10 @@ class Promise:
     """
     Expected free-run errors on another record of the same stage, % of stroke.
 
-    `same` is for the same kinds of motion in the same shares, `other` for motion of another kind
-    within the swings and speeds of these records.  `other` is None (unknown) if every segment of
-    motion was fitted, or if all motion is of one kind.  Hum, drift and other effects of time count
-    in full, because another record has them and the model lacks them.
+    `same` is for the same kinds of motion in the same shares.  `other` is for motion of another
+    kind within the swings and speeds of these records.  `other` is None, unknown, if every segment
+    of motion was fitted, or if all motion has one kind.  Hum, drift and other effects of time
+    count in full, because another record has them and the model lacks them.
     """
 
     same: float

@@ -5,8 +5,8 @@
 Find kinds of motion in a record without labels, from the voltage in each block.
 
 A block is described by the mean, the size and the speed of its voltage.  Similar blocks form a
-kind.  A kind with the smallest or largest mean, size or speed is always fitted, because a model
-fitted to the other kinds would extrapolate to it.
+kind.  The kinds with the smallest and the largest mean, size and speed are always fitted.  A
+model fitted to the other kinds would extrapolate to these kinds.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def motion_kinds(stretches: Sequence[Stretch], count: int) -> Integers | None:
     """
     Find the kind of motion of each of `count` blocks; -1 for blocks that are not held out.
 
-    The result is None if fewer than `FEWEST` kinds can be held out.
+    Returns None if fewer than `FEWEST` kinds can be held out.
     """
     described = np.full((count, 3), np.nan)
     for s in stretches:

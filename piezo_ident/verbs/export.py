@@ -44,7 +44,7 @@ def export_c(model: StageModel | MultiAxisModel, name: str = 'stage', **options:
     Raises
     ------
     DataError
-        When `model` is no model, or limits or slew are impossible.
+        When `model` is of another type, or limits or slew are impossible.
     ConfigError
         When the name is not allowed in C, or two axes have the same names in C.
     ModelError

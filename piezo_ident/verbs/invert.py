@@ -22,8 +22,8 @@ from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.multi_axis import EachAxis, MultiAxisModel
 from piezo_ident.model.stage_model import StageModel, warn_of_unused
 
-#: most rounds of an inversion of several axes, and largest change of a voltage in the last round,
-#: as a share of the span of the model
+#: most rounds of an inversion of several axes.  The rounds end once each voltage changes by less
+#: than this share of the span of the model
 ROUNDS, SAME = 6, 1e-5
 
 
@@ -98,15 +98,16 @@ def invert(
     model : StageModel or MultiAxisModel
     wanted : array_like, shape (n,), or mapping of str to array_like
         Displacement [m], sampled at the rate of the model.  A model of several axes needs a
-        mapping by axis; an absent axis rests at the displacement of its lowest voltage, or with
-        shared modes of the middle voltage of their fit.  The stage rests before and after the
-        motion: before it in the settled state after one stroke from the lowest voltage.  With
-        creep, begin at the displacement of the lowest voltage, which does not creep.
+        mapping by axis.  An absent axis rests at the displacement of its lowest voltage; with
+        shared modes it rests at the displacement of the middle voltage of their fit.  The stage
+        rests before and after the motion: before it in the settled state after one stroke from
+        the lowest voltage.  With creep, begin at the displacement of the lowest voltage, which
+        does not creep.
     channels : mapping of str to array_like, shape (n,), optional
         Further signals that effects of the model depend on.
     **options
         ``limits``, ``slew``, ``clip``, ``sample_rate`` and ``like`` of
-        `piezo_ident.control.inverse.invert`; they hold for each axis.
+        `piezo_ident.control.inverse.invert`.  These options hold for each axis.
 
     Returns
     -------

@@ -96,8 +96,8 @@ def identify(
     progress : callable, optional
         Called with the name of the step and its share done; may raise `Cancelled`.
     steps : Steps, optional
-        Results of earlier steps, for a stage of one axis.  With `steps`, even without results,
-        records without labelled segments are refused.
+        Results of earlier steps, for a stage of one axis.  With `steps`, even if it holds no
+        results, records must have labelled segments.
 
     Returns
     -------
@@ -190,8 +190,8 @@ def diagnose(
         From `identify`; it may hold effects already.
     records : Record, or sequence of Record
         Measured data that took no part in the identification, at the sampling rate of the model.
-        Of more than ``settings.most_samples``, the beginnings of the records are searched and
-        fitted, and a warning gives their length.
+        If the records have more than ``settings.most_samples``, their beginnings alone are
+        searched and fitted, and a warning gives the length of these beginnings.
     settings : DiagnosisSettings, optional
     progress : callable, optional
         Called with the name of the step and the share done; may raise `Cancelled`.
@@ -205,8 +205,8 @@ def diagnose(
     Raises
     ------
     IdentificationError
-        When the voltage never moves, the displacement does not follow it, too few samples are
-        left, or the joint fit is singular.
+        When the voltage always rests, the displacement does not follow the voltage, too few
+        samples are left, or the joint fit is singular.
 
     Examples
     --------

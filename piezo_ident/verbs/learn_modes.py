@@ -225,7 +225,7 @@ def _err_elsewhere(
         ]
         errors.append((rms_percent(ours), rms_percent(theirs)))
     modes, chain = np.sqrt(np.sum(np.square(errors), axis=0))
-    # without other motion both are not a number
+    # both are NaN if the records hold no other motion
     return bool(modes > chain)
 
 

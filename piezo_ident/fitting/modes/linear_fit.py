@@ -109,7 +109,7 @@ def choose_order(
     Returns
     -------
     Modal
-        The lowest order of those whose error is within `WORTH` of the least.
+        The lowest order with an error within `WORTH` of the least error.
     dict
         Error in % of each order that was tried.
     """

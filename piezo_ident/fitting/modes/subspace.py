@@ -4,7 +4,7 @@
 """
 A modal model from a frequency response, without a start: subspace of the frequency domain.
 
-The method is that of McKelvey, Akcay and Ljung (1996), doi:10.1109/9.508900.  The span of the
+The method is from McKelvey, Akcay and Ljung (1996), doi:10.1109/9.508900.  The span of the
 inputs is projected off the response at the lines.  The rest spans the observability matrix of the
 stage.  A shifts this matrix by one row.  B, C and D follow by least squares, in turns.
 """
@@ -55,7 +55,7 @@ def subspace(response: LineResponse, order: int) -> Modal:
 
 
 def _observability(response: LineResponse, rows: int) -> Array:
-    """Return an orthonormal basis of the span of G off that of the inputs, strongest first."""
+    """Return an orthonormal basis of the span of G off the span of the inputs, strongest first."""
     inputs = response.g.shape[2]
     powers = response.z[None, :] ** np.arange(rows)[:, None]
     spans = []

@@ -51,7 +51,7 @@ CHANCE, CREEPS = 0.01, 3e-5
 #: least number of repeats in a moving signal, and least share of the moving samples
 REPEATS, REPEATED = 4, 2e-4
 #: least share of repeats after which the signal catches up; level of the test against pauses of
-#: the motion, after which the signal seems to catch up in half of the cases
+#: the motion.  After a pause the signal seems to catch up in half of the cases
 MADE_UP, BY_CHANCE = 0.7, 1e-3
 #: samples that give the step of a converter, and samples of a row of them
 MOST, MOST_ROW = 2**17, 2**10

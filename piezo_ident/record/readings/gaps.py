@@ -4,10 +4,10 @@
 """
 Bridge short gaps in a record for fitting.
 
-Reading splits a record where samples are missing, but the stage keeps its memory: in a short gap
-the voltage moves on to its next value, and the plays with it.  Straight lines join pieces of one
-clock.  If the displacement alone is missing, the voltage joins pieces over any time.  Every fit
-and every error leaves out a gap, and the time `SETTLING` after it.
+Reading splits a record where samples are missing, but the stage keeps its memory.  In a short gap
+the voltage moves on to its next value, and the plays move with it.  Straight lines join pieces of
+one clock.  If the displacement alone is missing, the voltage joins pieces over any time.  Every
+fit and every error leaves out a gap, and the time `SETTLING` after it.
 """
 
 from __future__ import annotations

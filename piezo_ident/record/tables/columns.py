@@ -261,7 +261,7 @@ def _fitting(role: str, columns: Iterable[tuple[int, str]]) -> list[int]:
         base = 'time' if base.casefold() == 'x_value' else base
         words = set(re.findall(r'[^\W\d_]+', re.sub(r'([a-z])([A-Z])', r'\1 \2', base).casefold()))
         named = {r for r, known in _WORDS.items() if words & set(known.split())}
-        # the voltage of a sensor is neither a command nor a displacement
+        # a name with words of two quantities, as `sensor voltage`, fits neither quantity
         if named == {role}:
             by_word.append(i)
         elif measured and not named:

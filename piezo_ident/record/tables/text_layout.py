@@ -65,7 +65,7 @@ def cells_of(line: str, separator: str | None) -> list[str]:
 
 
 def find_layout(lines: Sequence[str]) -> Layout | None:
-    """Return the layout of the first lines of a file, None without a table in them."""
+    """Return the layout of the first lines of a file, or None if the lines hold no table."""
     filled = [i for i, line in enumerate(lines) if line.strip()]
     if own := _own(lines, filled):
         return own

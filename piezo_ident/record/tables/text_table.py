@@ -45,7 +45,7 @@ def read_text(path: Path, options: ReadOptions) -> RecordTable:
     """Read a table in text, below any other text."""
     with path.open('rb') as file:
         marked = file.read(2) in (b'\xff\xfe', b'\xfe\xff')
-    # utf-8-sig drops a byte order mark; cp1252 is what Windows writes in the west
+    # utf-8-sig drops a byte order mark; Windows writes cp1252 in the west
     for encoding in ['utf-16'] if marked else ['utf-8-sig', 'cp1252']:
         try:
             with path.open(encoding=encoding) as file:
