@@ -80,7 +80,7 @@ def assemble(
     """
     Make a record in SI units of raw columns: time [s], voltage [V] and displacement, shape (n,).
 
-    `v` or `y` become NaN if they are None.  `segments` are the label of each stretch and the row
+    A `v` or `y` that is None becomes NaN.  `segments` are the label of each stretch and the row
     at which it begins; an empty label means none.  `channels` are further signals, ``v_<name>``
     and ``y_<name>`` the signals of another axis.  The unit of `y` and the limits of `v` in the
     `options` hold for all axes.  The stamps must agree with the `sample_rate` [Hz] that a file

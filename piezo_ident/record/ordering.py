@@ -6,8 +6,8 @@ Bring rows into the order of time: drop repeats, mark restarts, refuse disorder.
 
 Time that jumps back is a restart between two stretches of at least ten samples.  The jump ends at
 or before the first stamp of the first stretch, or goes back by more than a thousand samples (ten
-blocks).  Rows that repeat earlier rows are dropped, unless they start over from the beginning and
-go on for more than two blocks: a simulation without noise, run again.
+blocks).  Rows that repeat earlier rows are dropped.  They stay if they start over from the
+beginning and go on for more than two blocks: this is a simulation without noise, run again.
 
 Time may be rounded to more than the sampling period.  At 5 kHz, five stamps in whole milliseconds
 are equal.  Stamps of a long record still bound the sampling rate closely.  The rate of few digits

@@ -34,7 +34,7 @@ def judged_modes(
     model: StageModel, runs: Sequence[JudgedRun], held_out: Mapping[str, float], stroke: float
 ) -> tuple[StageModel, Promise | None]:
     """
-    Give the model of an axis errors and band of shared modes, beside the errors of its chain.
+    Give the model of an axis errors and band of shared modes, beside errors and band of its chain.
 
     If the samples are too few, the model stays as it is, and the promise is None.
 

@@ -10,7 +10,7 @@ With elements l_ji of creep of the voltage u_j they are
     w_j = sum_i c_ji l_ji + g_j u_j + a constant of each piece
 
 The gain g_j takes the error that follows the voltage at once, because a wide loop has another gain
-than multisines.  It does not belong to the model.
+than multisines.  The model leaves g_j out.
 """
 
 from __future__ import annotations

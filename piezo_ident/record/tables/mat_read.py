@@ -43,7 +43,7 @@ def read_variables(path: Path, wanted: str, needed: Iterable[str] | None) -> Col
 
     `wanted` is a regular expression; numbers keep their shape, texts and cells of texts become
     arrays of str.  If the file lacks a `needed` variable, or `needed` is None, the result is all
-    columns of numbers with their names, also columns in structs (see `flat`).
+    columns of numbers with their names instead, also columns in structs (see `flat`).
     The last mapping gives the name of a column by the path to it, if a title names the column.
     ValueError for a damaged or too large file, or a wanted variable without numbers or texts.
     """
