@@ -350,6 +350,7 @@ from a pair, beside four peers of twenty lines each. The simulated stages have a
 hysteresis than the model, two or three light modes and a delay of any part of a sample. A
 record has 6 s at 10 kHz, noise of 0.005 to 0.05 % of stroke. The error is
 100 rms(y - y_hat) / (max y - min y) in free run on another realisation of the motion.
+Realisations differ in speed, so triangles may be judged on a branch that was not fitted.
 `make any-record` writes this page (seeds {seeds}).
 
 Of {cases} cases {good} err at most 1.05 times as much as the best peer; the median is {median:.2f}
