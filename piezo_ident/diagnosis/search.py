@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import cache, partial
 from operator import attrgetter
 from threading import Event
-from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -59,6 +58,8 @@ OF_LEAST = 0.01
 INDISTINCT = 0.01
 #: interval at which a caller may stop the search [s]
 ASKED = 0.1
+#: a candidate after a few iterations: its best fit, and its best fit from a wide H
+_Begun = tuple[Fitted, Fitted]
 _error, _by_error = attrgetter('mean_square'), attrgetter('error')
 
 
@@ -189,13 +190,6 @@ def _add_plain_starts(
             states.append(state.with_effect(started(simulator.rows, one)))
 
 
-class _Begun(NamedTuple):
-    """A candidate after a few iterations: its best fit, and its best fit from a wide H."""
-
-    fitted: Fitted
-    beside_wide: Fitted
-
-
 class _JointFits:
     """
     Joint fits of the candidates of a round: all of them begin, and the best go to the end.
@@ -234,10 +228,10 @@ class _JointFits:
             fits = [one for one in fit_starts(self._simulator, states, begin, self._alive) if one]
             least = min([least, *map(_error, fits)])
             if fits:
-                found.append(_Begun(min(fits, key=_error), min(fits[:STARTS], key=_error)))
+                found.append((min(fits, key=_error), min(fits[:STARTS], key=_error)))
             else:
                 self.warnings.append(f'{effect.name} was not judged: its fits fail on these data')
-        return sorted(found, key=lambda one: _error(one.fitted))
+        return sorted(found, key=lambda one: _error(one[0]))
 
     def _begin(
         self, until: Until, own: Simulator, state: State, tick: Callable[[], None]
