@@ -11,7 +11,7 @@ prediction is linear in these amplitudes, a few numbers for each record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -27,14 +27,12 @@ from piezo_ident.effects.creep import AT_ONCE
 EARLIER_LEAVES = 0.5
 
 
-def with_earlier_motion(
-    simulator: Simulator, fitted: Fitted, tick: Callable[[], None] = lambda: None
-) -> Fitted:
+def with_earlier_motion(simulator: Simulator, fitted: Fitted) -> Fitted:
     """
     Add creep from earlier motion to a fit with creep, if that helps clearly.
 
     The earlier creep must lower the error on held-out blocks to `EARLIER_LEAVES` of it.  Its size
-    must be possible after motion within the range.  `tick` is called between the steps of a fit.
+    must be possible after motion within the range.
     """
     state = fitted.state
     creep = _creep_of(simulator, state)
@@ -45,7 +43,7 @@ def with_earlier_motion(
     start = replace(state, fading=times, earlier=none)
     if not _may_help(simulator, fitted, start):
         return fitted
-    rested, crept = (tried(_settled, simulator, one, tick) for one in (state, start))
+    rested, crept = (tried(_settled, simulator, one) for one in (state, start))
     if rested is None or crept is None:
         # a fit fails, so the data do not hold this creep
         return fitted
@@ -85,11 +83,11 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
     return bool(np.all((ends.min(axis=1) - doubt <= left) & (left <= ends.max(axis=1) + doubt)))
 
 
-def _settled(simulator: Simulator, state: State, tick: Callable[[], None]) -> Fitted:
+def _settled(simulator: Simulator, state: State) -> Fitted:
     """Fit a state, again and again with fresh columns of H, as long as the error falls."""
-    fitted = fit_jointly(simulator, state, tick=tick)
+    fitted = fit_jointly(simulator, state)
     for _ in range(POLISHING):
-        fresh = fit_jointly(simulator, fitted.state, tick=tick)
+        fresh = fit_jointly(simulator, fitted.state)
         if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
             break
         fitted = fresh
