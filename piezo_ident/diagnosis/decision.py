@@ -272,9 +272,9 @@ def _rivals_of(candidates: Candidates, best: FittedSet) -> tuple[tuple[str, ...]
     if candidates.is_part(left, whole):
         # the law of the remaining error is unknown: a rival may remove most of the same error
         most = max(most, left + TAKES * (whole - left))
-    sets = [c.effects for c in candidates.bests if len(c.effects) == len(best.effects)]
-    others = [s for s in sets if s != best.effects]
-    bests = [candidates.best(s, best.effects) for s in others if best.effects not in _narrower(s)]
+    others = (c.effects for c in candidates.bests if len(c.effects) == len(best.effects))
+    sets = (s for s in others if s != best.effects and best.effects not in _narrower(s))
+    bests = [candidates.best(s, best.effects) for s in sets]
     return tuple(c.effects for c in bests if c is not None and candidates.left(c) <= most)
 
 
