@@ -308,7 +308,8 @@ class LiveError:
             first = max(0, end - EDGE)
             self._last, self._judged = x[:, first:], end - first
             e = e[begin:end]
-        kept, out = (_sums_of(e[w]) for w in (~wild, wild))
+        # numbers of errors, and sums of them and of their squares
+        kept, out = (np.array([x.size, x.sum(), x @ x]) for x in (e[~wild], e[wild]))
         return kept, out
 
     def _sums(self) -> tuple[Array, int]:
@@ -340,8 +341,3 @@ class LiveError:
         """Root mean square [m]; NaN before the first sample."""
         (n, _, square), _ = self._sums()
         return float(np.sqrt(square / n)) if n else float('nan')
-
-
-def _sums_of(e: Array) -> Array:
-    """Count errors, and sum them and their squares."""
-    return np.array([e.size, e.sum(), e @ e])

@@ -308,7 +308,9 @@ class Predictor:
             self._run.forget()
 
     def _advance(self, t: Array, v: Array) -> Array | None:
-        self._remember(t, v)
+        for k, past in enumerate(self._pasts):
+            self._lowest[k] = min(self._lowest[k], float(v[k].min()))
+            past.add(t, v[k])
         model = self.model
         if model is None:
             return None
@@ -326,11 +328,6 @@ class Predictor:
             return None
         self.felt = self._run.felt
         return y
-
-    def _remember(self, t: Array, v: Array) -> None:
-        for k, past in enumerate(self._pasts):
-            self._lowest[k] = min(self._lowest[k], float(v[k].min()))
-            past.add(t, v[k])
 
 
 def _with_band(model: StageModel | MultiAxisModel, axes: Sequence[str]) -> list[StageModel]:
