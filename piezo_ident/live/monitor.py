@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -246,6 +247,51 @@ class TrackingError:
             errors.append(Samples(pair.t, e, pair.segment, self._quantity))
             self.live.add(pair.t, e, self._high - self._low, pair.y)
         return errors
+
+
+class TrackingErrors:
+    """
+    Wanted minus measured displacement of each axis.
+
+    `tails` are the suffixes of the topics of all axes, `each` has the error by suffix.  The rms is
+    taken over a time `window` [s].  `percents` has the rms of each axis at the last `look` [% of
+    the span of the wanted motion].
+    """
+
+    def __init__(self, tails: Sequence[str], window: float) -> None:
+        self.each = {tail: TrackingError(window, f'tracking_error{tail}') for tail in tails}
+        self.percents: dict[str, float] = {}
+
+    def clear(self) -> None:
+        """Forget the errors so far."""
+        for one in self.each.values():
+            one.live.clear()
+
+    def wanted(self, t: Array, rows: Array, segment: str) -> list[Samples]:
+        """Take the wanted motion of all axes, a row each; return the errors that it completes."""
+        return [
+            error
+            for one, row in zip(self.each.values(), np.atleast_2d(rows), strict=True)
+            for error in one.wanted(Samples(t, row, segment, 'reference'))
+        ]
+
+    @property
+    def outliers(self) -> int:
+        """Number of readings that the errors leave out."""
+        return sum(one.live.outliers for one in self.each.values())
+
+    def look(self) -> None:
+        """Update `percents`."""
+        percents = {tail: one.percent for tail, one in self.each.items()}
+        self.percents = {tail: x for tail, x in percents.items() if x is not None}
+
+    def figures(self) -> dict[str, str]:
+        """List the errors of the last `look`, for /diagnostics."""
+        figures = {}
+        for tail, of_span in self.percents.items():
+            figures[f'tracking_rms{tail}'] = f'{self.each[tail].live.rms:.6g}'
+            figures[f'tracking_percent{tail}'] = f'{of_span:.4g}'
+        return figures
 
 
 class LiveError:

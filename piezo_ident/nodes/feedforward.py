@@ -49,9 +49,10 @@ from piezo_ident.common.errors import ConfigError, DataError, ModelError
 from piezo_ident.live.axis_drive import Drive, Successor
 from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
+from piezo_ident.live.join import Reference
 from piezo_ident.live.live_learning import Learner, LiveLearning
+from piezo_ident.live.monitor import TrackingErrors
 from piezo_ident.live.pacing import Looks, Rate
-from piezo_ident.live.reference import Reference, TrackingErrors
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.live.tracker import check_unit, Prepared, prepared, Tracker
 from piezo_ident.model.multi_axis import models_of
