@@ -16,8 +16,12 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.operators.dynamics import Dynamics
-from piezo_ident.uncertainty.linearised import BLOCKS, linearised
-from piezo_ident.uncertainty.parameters import quantities_of, with_deviations
+from piezo_ident.uncertainty.parameters import (
+    BLOCKS,
+    linearised,
+    quantities_of,
+    with_deviations,
+)
 import pytest
 
 PROGRAM = """
