@@ -110,13 +110,11 @@ class GainDrift(Effect):
 
     def process(self, block: Block) -> Block:
         """Multiply the block by the gain at each time."""
-        if not self.array('gain').any():
-            return block
-        return block.with_signal(self._scaled(np.ascontiguousarray(block.x), block.t))
-
-    def _scaled(self, x: Array, t: Array) -> Array:
         time, gain = self.array('time'), self.array('gain')
-        return _with_gain(x, np.ascontiguousarray(t), np.searchsorted(t, time), time, gain)
+        if not gain.any():
+            return block
+        x, t = np.ascontiguousarray(block.x), np.ascontiguousarray(block.t)
+        return block.with_signal(_with_gain(x, t, np.searchsorted(t, time), time, gain))
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
