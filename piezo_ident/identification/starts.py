@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -116,7 +117,8 @@ def fit_starts(
     chosen = min(others, key=lambda one: one.loss)
     stage = (chosen if chosen.loss < (1.0 - CLEARLY) * plain.loss else plain).stage
     for i in sought:
-        rules[i] = _rule(float(excerpts[i].u[0]), float(law.thresholds[-1]), stage.starts[i])
+        u0, widest = float(excerpts[i].u[0]), float(law.thresholds[-1])
+        rules[i] = partial(memory_of, u0, widest, stage.starts[i])
     return rules
 
 
@@ -142,7 +144,3 @@ def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
         if rule is not None:
             fitted_runs[i] = replace(runs[i], memory=rule, known=runs[i].use)
     return fitted_runs
-
-
-def _rule(u0: float, widest: float, shares: Array) -> Rule:
-    return lambda thresholds: memory_of(u0, widest, shares, thresholds)
