@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 from piezo_ident.common.config import shipped_names
-from piezo_ident.identification.settings import Solver
+from piezo_ident.identification.settings import SOLVERS
 from piezo_ident.record.options import parse_columns, scaled_unit, UNITS
 
 
@@ -243,7 +243,7 @@ SIMULATE = [
     _flag('--voltage-only', 'Write the columns t, v and segment, to drive a real stage.'),
 ]
 
-_solver = click.Choice(get_args(Solver))
+_solver = click.Choice(SOLVERS)
 #: fields of `Settings`
 IDENTIFY = [
     _option('--thresholds', _thresholds, 'N|auto', 'Plays of H (default: by held-out error).'),

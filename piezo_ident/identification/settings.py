@@ -13,6 +13,7 @@ from typing import Any, get_args, Literal
 from piezo_ident.common.errors import ConfigError, expect_numbers
 
 Solver = Literal['least_squares', 'swarm', 'joint']
+SOLVERS: tuple[str, ...] = get_args(Solver)
 #: callback with the name of the step and its share done; it raises `Cancelled` to stop
 Progress = Callable[[str, float], None]
 
@@ -79,7 +80,7 @@ class Settings:
         sizes: Any = self.order or (1, 1)
         rules = {
             'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
-            'solver': (self.solver in get_args(Solver), ' or '.join(get_args(Solver))),
+            'solver': (self.solver in SOLVERS, ' or '.join(SOLVERS)),
             'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
             'max_order': (1 <= self.max_order <= 50, '1 to 50'),
             'order': (

@@ -13,9 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
 
-from piezo_ident.identification.settings import Solver
+from piezo_ident.identification.settings import SOLVERS
 from piezo_ident.live.predictor import LEVEL
 from piezo_ident.model.observer import HORIZON
 
@@ -145,7 +144,7 @@ IDENTIFIER = (
         'solver',
         'least_squares',
         'solver of the weights of H; joint: one fit instead of the three steps',
-        choices=get_args(Solver),
+        choices=SOLVERS,
     ),
     Declaration('polish', False, 'whether least squares refine the result of the swarm'),
     Declaration('max_order', 15, 'largest na and nb that are tried', '1', 1, 50),
