@@ -110,20 +110,11 @@ def errors_of(
                 ('selection', part & selection),
                 ('held out', part & p.judged & ~fitted & ~selection),
             ):
-                if not mask.any():
-                    continue
-                y, y_hat = piece.y[mask], p.y_hat[mask]
-                rows.append(
-                    ErrorRow(
-                        record=p.run.record,
-                        segment=label,
-                        percent=percent_of_stroke(y, y_hat, stroke),
-                        static_percent=percent_of_stroke(y, p.y_static[mask], stroke),
-                        fit=fit_percent(y, y_hat),
-                        n=int(mask.sum()),
-                        data=data,
-                    )
-                )
+                if mask.any():
+                    y = piece.y[mask]
+                    both = (percent_of_stroke(y, x[mask], stroke) for x in (p.y_hat, p.y_static))
+                    fit = fit_percent(y, p.y_hat[mask])
+                    rows.append(ErrorRow(p.run.record, label, *both, fit, y.size, data))
     return rows
 
 

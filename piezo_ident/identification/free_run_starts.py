@@ -13,6 +13,7 @@ result predicts these samples as well as the best start.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -219,6 +220,14 @@ class Search:
         for (na, _), (d, G) in sorted(starts.items()):
             one = self._fit(_with_dynamics(first.stage, d, G), MANY)
             candidates.append(self._candidate(f'order {na}', one))
+        if self.allowed.order is not None:
+            # the user has chosen against H alone
+            del candidates[0]
+            if not candidates:
+                raise IdentificationError(
+                    f'order: least squares finds no stable G of order {self.allowed.order} in the '
+                    'fitted parts; record longer, or give another order (--order) or none'
+                )
         return candidates + self._later(best_of(candidates))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
@@ -317,11 +326,9 @@ class Search:
             start = Stage.linear(self.law, G, d, self.guesses)
             if stage is not None:
                 start = _with_dynamics(stage, d, G)
-            try:
+            # a start that diverges is dropped
+            with suppress(IdentificationError):
                 fits.append(self._fit(start, FEW))
-            except IdentificationError:
-                # a start that diverges is dropped
-                continue
         return fits
 
 
