@@ -21,8 +21,7 @@ def effect_name(text: str) -> str:
     """Check the name of an effect; ConfigError suggests a similar name."""
     if text in catalogue():
         return text
-    guess = did_you_mean(text.lower().replace('-', '_'), catalogue())
-    cure = guess or 'see piezo_ident effects'
+    cure = did_you_mean(text.lower().replace('-', '_'), catalogue()) or 'see piezo_ident effects'
     raise ConfigError(f'unknown effect {text!r}; {cure}')
 
 
@@ -67,10 +66,7 @@ def _documentation(effect: type[Effect]) -> str:
 def _at_length(effect: type[Effect]) -> str:
     notes = [
         (effect.rate_independent, 'follows the path of the voltage alone, as hysteresis does'),
-        (
-            effect.in_dynamics,
-            'changes the dynamics: named beyond errors of identification',
-        ),
+        (effect.in_dynamics, 'changes the dynamics: named beyond errors of identification'),
         (effect.time_driven, 'driven by time: its amplitudes differ from record to record'),
     ]
     head = ('parameter', 'unit', 'from', 'to', 'neutral', 'default', '')

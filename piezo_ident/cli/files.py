@@ -110,19 +110,14 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
     """Refuse options for bags if all records are tables, and options for tables if all bags."""
     tables = all(p.is_file() and not storage_of(p) for p in paths)
-    for option in ('namespace', 'voltage_topic', 'displacement_topic'):
-        if tables and getattr(args, option, None) is not None:
-            raise ConfigError(
-                f'--{option.replace("_", "-")} is for bags, and {paths[0]} is a table; leave it '
-                'out'
-            )
     bags = all(p.is_dir() or storage_of(p) for p in paths)
-    for option in ('columns', 'rate', 'time_unit', 'voltage_unit'):
-        if bags and getattr(args, option, None) is not None:
-            raise ConfigError(
-                f'--{option.replace("_", "-")} is for tables, and {paths[0]} is a bag; leave it '
-                'out'
-            )
+    kind, other = ('bags', 'a table') if tables else ('tables', 'a bag')
+    topics = 'namespace', 'voltage_topic', 'displacement_topic'
+    cells = 'columns', 'rate', 'time_unit', 'voltage_unit'
+    for name in topics if tables else cells if bags else ():
+        if getattr(args, name, None) is not None:
+            option = f'--{name.replace("_", "-")}'
+            raise ConfigError(f'{option} is for {kind}, and {paths[0]} is {other}; leave it out')
 
 
 def fields_of(args: SimpleNamespace, kind: type) -> dict[str, Any]:

@@ -122,8 +122,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     if args.out is not None:
         with deferred_interrupts():
             for axis, parts in pieces.items():
-                if voltage_of(axis) != 'v':
-                    v = voltage_of(axis)
+                if (v := voltage_of(axis)) != 'v':
                     columns[v] = [piece.channels[v] for piece in record]
                 columns[f'y_hat{axis[1:]}'] = parts
                 if args.interval:

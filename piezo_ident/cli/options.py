@@ -11,12 +11,14 @@ Every verb that reads records then has this option.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+import os
 from pathlib import Path
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 from piezo_ident.common.config import shipped_names
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.identification.settings import SOLVERS
 from piezo_ident.record.options import parse_columns, scaled_unit, UNITS
 
@@ -97,6 +99,21 @@ def _option(name: str, kind: Any, metavar: str | None, text: str, **more: Any) -
     return click.Option([name], type=kind, metavar=metavar, help=text, **more)
 
 
+def _apart(ctx: Any, param: Any, path: Path | None) -> Path | None:
+    """Refuse an output at the path of another output of the command."""
+    for other in (x for x in ctx.command.params if x.callback is _apart):
+        name, place = other.opts[0], ctx.params.get(other.name)
+        # a place is absent until its option is parsed
+        if path and isinstance(place, Path) and os.path.realpath(place) == os.path.realpath(path):
+            both = f'{name} {place} and {param.opts[0]} {path}'
+            raise ConfigError(f'{both} are one path; give each output a path of its own')
+    return path
+
+
+def _output(name: str, metavar: str, text: str) -> click.Option:
+    return _option(name, _file, metavar, text, callback=_apart)
+
+
 def _unit_of(quantity: str, role: str) -> click.Option:
     known = UNITS[role]
 
@@ -127,10 +144,8 @@ OVERWRITE = _flag('--overwrite', 'Replace outputs that exist.')
 MODEL, MODEL_FILE = _argument('model', 'MODEL'), _argument('model_file', 'MODEL')
 IN, OUT = _argument('record', 'IN'), _argument('out', 'OUT')
 REFERENCE = _argument('record', 'REFERENCE')
-RECORD, RECORDS = (
-    _argument('record', 'RECORD'),
-    _argument('records', 'RECORD...', nargs=-1, required=True),
-)
+RECORD = _argument('record', 'RECORD')
+RECORDS = _argument('records', 'RECORD...', nargs=-1, required=True)
 EFFECT = _argument('name', '[NAME]', type=_name, required=False, **_among(_effects))
 NODE = _argument('name', '[NAME]', type=str, required=False)
 NODE_ARGUMENTS = _argument('arguments', '[ARGUMENTS]...', nargs=-1, type=click.UNPROCESSED)
@@ -161,8 +176,8 @@ EACH = [
 ]
 
 RESULTS = [
-    _option('--model', _file, 'YAML', 'Write the model there.'),
-    _option('--report', _file, 'DIR', 'Write page and pictures there.'),
+    _output('--model', 'YAML', 'Write the model there.'),
+    _output('--report', 'DIR', 'Write page and pictures there.'),
     _option('--validation', _file, 'RECORD...', 'Predict these; do not fit them.', multiple=True),
     OVERWRITE,
 ]
@@ -173,8 +188,8 @@ OUTPUT = [
 ]
 
 PREDICT = [
-    _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
-    _option('--plot', _file, 'PICTURE', 'Picture of measured and predicted.'),
+    _output('--out', 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
+    _output('--plot', 'PICTURE', 'Picture of measured and predicted.'),
     _option(
         '--interval',
         click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
@@ -185,24 +200,20 @@ PREDICT = [
 ]
 
 INVERT = [
-    _option('--out', _file, 'OUT', 'Table .csv or .npz with the columns t, v.'),
-    _option('--plot', _file, 'PICTURE', 'Picture of voltage, wanted and predicted motion.'),
+    _output('--out', 'OUT', 'Table .csv or .npz with the columns t, v.'),
+    _output('--plot', 'PICTURE', 'Picture of voltage, wanted and predicted motion.'),
     OVERWRITE,
 ]
 
 EXPORT = [
-    _option('--out', _file, 'FILE', 'Header .h or unit .fmu.'),
+    _output('--out', 'FILE', 'Header .h or unit .fmu.'),
     _option('--format', click.Choice(['c', 'fmu']), None, 'Default: by the ending of FILE.'),
     _option('--name', _name, 'NAME', 'Start of all names in it (default: the name of the file).'),
     OVERWRITE,
 ]
 
 #: options for reading a wanted motion
-MOTION = [
-    option
-    for option in READING
-    if option.name in ('columns', 'rate', 'time_unit', 'displacement_unit')
-]
+MOTION = [x for x in READING if x.name in ('columns', 'rate', 'time_unit', 'displacement_unit')]
 
 #: limits of a voltage
 KEPT = [
