@@ -85,8 +85,7 @@ def blocks_of(
     """
     size = max(SHORTEST, sum(int(run.use.sum()) for run in runs) // BLOCKS)
     Y, highest = abs(model.scaling.Y), 0.0
-    labels, commands, squares, motions = list[str](), list[Array](), list[float](), list[Array]()
-    weights, fitted = list[int](), list[bool]()
+    rows = list[tuple[str, Array, float, Array, int, bool]]()
     for run in runs:
         u, x = model.scaling.u(run.piece.v), model.scaling.x(run.predicted)
         stream, e = Motion(model), run.error
@@ -96,20 +95,18 @@ def blocks_of(
             factor = _unfitted(e[start:stop] ** 2, use, run.held[start:stop])
             for part in np.array_split(np.arange(stop - start), max(1, round(use.size / size))):
                 own = part[use[part]]
-                if own.size < SHORTEST:
-                    continue
-                square = factor * float(np.mean(e[start + own] ** 2))
-                labels.append(label)
-                commands.append(u[start + part])
-                squares.append((square + (excess or {}).get(label, 0.0)) / Y**2)
-                motions.append(np.append(1.0, np.mean(motion[:, own] ** 2, axis=1)))
-                weights.append(own.size)
-                fitted.append(not run.held[start + own].all())
-    if len(labels) < 2 or not np.isfinite(squares).all():
-        # a model that diverges has no band
+                if own.size >= SHORTEST:
+                    square = factor * float(np.mean(e[start + own] ** 2))
+                    square = (square + (excess or {}).get(label, 0.0)) / Y**2
+                    squares = np.append(1.0, np.mean(motion[:, own] ** 2, axis=1))
+                    was_fitted = not run.held[start + own].all()
+                    rows.append((label, u[start + part], square, squares, own.size, was_fitted))
+    # a model that diverges has no band
+    if len(rows) < 2 or not np.isfinite([row[2] for row in rows]).all():
         return None
+    labels, commands, errors, motions, weights, fitted = zip(*rows, strict=True)
     kind = np.unique(held_out_kinds(labels, commands)[0], return_inverse=True)[1]
-    square = np.maximum(np.array(squares), LEAST**2)
+    square = np.maximum(np.array(errors), LEAST**2)
     used = np.bincount(kind, fitted)[kind] > 0
     return Blocks(square, np.array(motions), kind, used, np.array(weights), highest)
 

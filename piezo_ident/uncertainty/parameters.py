@@ -37,13 +37,17 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.selection.judged import Judged, JudgedRun
 
 #: entries of a model file, below `identification`
-QUANTITIES, PARAMETERS = 'quantities', 'uncertainties'
+QUANTITIES, PARAMETERS, MISSING = 'quantities', 'uncertainties', 'not_identified'
 #: number of frequencies at which G is stated, and the lowest as a share of the highest (taste)
 FREQUENCIES, LOWEST = 10, 1e-2
 #: swings at which the width of the loop is stated, as shares of the range
 SWINGS = (0.25, 0.5, 1.0)
 #: points of a quarter of a loop
 POINTS = 100
+#: reason why a loop is not identified
+CLOSED = 'no play with a weight is as narrow as this loop; give more thresholds (--thresholds)'
+#: width of a loop that is rounding, normalised
+ROUNDING = 1e-12
 #: largest distance of a replica from its mode, as a share of the frequency
 SAME_MODE = 0.2
 #: number of blocks of each step, and most rows of its equations (time)
@@ -62,23 +66,26 @@ def with_deviations(result: Identification, judged: Judged) -> Identification:
     model, frequencies = result.model, _frequencies(result)
     near = fitted.stage.dynamics
     rows = list(_quantities(fitted.stage, model, frequencies, near))
-    at = np.array([row.value for row in rows], dtype=np.float64)
-    replicas = []
-    for stage in fitted.replicates():
-        moved = [row.value for row in _quantities(stage, model, frequencies, near)]
-        replicas.append(np.concatenate([moved, _coefficients(stage)]))
-    whole = np.concatenate([at, _coefficients(fitted.stage)])
-    std = deviations(np.array(replicas).reshape(-1, whole.size), whole)
-    orders = [replace(fitted.stage, dynamics=G) for G in result.dynamics.others]
-    others = [[row.value for row in _quantities(x, model, frequencies, near)] for x in orders]
-    off = np.array([at, *others], dtype=np.float64) - at
-    std[: at.size] = np.hypot(std[: at.size], np.sqrt(np.mean(off**2, axis=0)))
-    # a mode that replicates or other orders lack is unknown
-    told = np.where(np.isfinite(std), std, np.inf)
-    quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=False)]
+
+    def values(stage: Stage) -> Array:
+        own = [row.value for row in _quantities(stage, model, frequencies, near)]
+        return np.concatenate([np.array(own, dtype=np.float64), _coefficients(stage)])
+
+    at = values(fitted.stage)
+    replicas = [values(stage) for stage in fitted.replicates()]
+    std, more = np.split(deviations(np.array(replicas).reshape(-1, at.size), at), [len(rows)])
+    others = [values(replace(fitted.stage, dynamics=G)) for G in result.dynamics.others]
+    off = np.array([x[: len(rows)] - at[: len(rows)] for x in (at, *others)])
+    std = np.hypot(std, np.sqrt(np.mean(off**2, axis=0)))
+    # a mode that replicates or other orders lack is unknown, and so is a loop that no play opens
+    closed = (at[: len(rows)] == 0.0) & (std == 0.0)
+    told = np.where(np.isfinite(std) & ~closed, std, np.inf)
+    quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=True)]
+    missing = (*result.not_identified, *((rows[i].name, CLOSED) for i in np.flatnonzero(closed)))
     known = {**model.identification, QUANTITIES: quantities}
-    known[PARAMETERS] = _of_coefficients(fitted.stage, model, std[at.size :], known)
-    return replace(result, model=replace(model, identification=known))
+    known[PARAMETERS] = _of_coefficients(fitted.stage, model, more, known)
+    known[MISSING] = [f'{what}: {why}' for what, why in missing]
+    return replace(result, model=replace(model, identification=known), not_identified=missing)
 
 
 def quantities_of(model: StageModel, result: Identification) -> list[ModelParameter]:
@@ -147,7 +154,8 @@ def _loop_width(stage: Stage, low: float, size: float) -> float:
     """Return the width of a loop in its middle, normalised; it is closed after one cycle."""
     up = np.linspace(low, low + size, 2 * POINTS + 1)
     w = stage.hysteresis(np.concatenate([up, up[-2::-1], up[1:], up[-2::-1]]))
-    return float(w[7 * POINTS] - w[5 * POINTS])
+    width = float(w[7 * POINTS] - w[5 * POINTS])
+    return 0.0 if abs(width) < ROUNDING else width
 
 
 def linearised(result: Identification, judged: Judged) -> Linearised | None:

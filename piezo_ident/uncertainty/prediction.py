@@ -34,11 +34,8 @@ def half_widths(
     """
     half = list[Array]()
     for pieces in connected_pieces(record):
-        first = len(half)
-        if estimated is None:
-            stream = BandStream(model, level, plays=is_at_rest(model, pieces[0]), creep=False)
-        else:
-            stream = BandStream(model, level, plays=not estimated[first])
+        known = is_at_rest(model, pieces[0]) if estimated is None else not estimated[len(half)]
+        stream = BandStream(model, level, plays=known, creep=estimated is not None)
         for piece in pieces:
             half.append(stream.follow(piece.v, predicted[len(half)]))
     return tuple(half)

@@ -16,6 +16,8 @@ from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.operators.dynamics import Dynamics
+from piezo_ident.operators.play import play_columns
+from piezo_ident.record.record import Record
 from piezo_ident.uncertainty.parameters import (
     BLOCKS,
     linearised,
@@ -24,6 +26,7 @@ from piezo_ident.uncertainty.parameters import (
 )
 import pytest
 
+SHARES = ('25%', '50%', '100%')
 PROGRAM = """
 limits: [0, 10]
 rest: 0
@@ -127,6 +130,30 @@ def test_a_parameter_that_the_data_do_not_know_says_so():
     assert 'not known' in model.summary()
     broken = replace(STAGE.model, identification={'quantities': [{'part': 'G'}, 3]})
     assert broken.quantities == ()
+
+
+def test_a_loop_narrower_than_every_play_is_not_identified():
+    sizes = np.repeat([10.0, 7.0, 4.0, 9.0], 1000)
+    v = 0.5 * sizes * (1.0 - np.cos(2.0 * np.pi * np.arange(4000) / 1000.0))
+    plays = play_columns(v / 10.0, np.array([0.25, 0.5]), np.zeros(2))
+    y = 7e-5 * (0.06 * v + np.array([0.25, 0.15]) @ plays)
+    y += 7e-9 * np.random.default_rng(0).standard_normal(v.size)
+    record = Record.from_arrays(v, y, sample_rate=1000)
+    result = with_deviations(*identify_and_judge(record, Settings(thresholds=4, delay=0)))
+    rows = {p.name: p for p in result.model.quantities}
+    narrow, *wider = (rows[f'loop width at {share} of the range'] for share in SHARES)
+    assert narrow.value == 0.0 and np.isinf(narrow.std)
+    assert all(row.is_known for row in wider)
+    reasons = dict(result.not_identified)
+    assert '--thresholds' in reasons[narrow.name]
+    assert (
+        f'{narrow.name}: {reasons[narrow.name]}' in result.model.identification['not_identified']
+    )
+    assert not any(row.name in reasons for row in wider)
+    assert not any('loop' in what for what, _ in deviating().not_identified)
+    # more of the same motion would not help
+    prompt = report.Prompt('model.yaml', '', {'record': 'record.npz'})
+    assert not any('loop' in step.reason for step in report.next_steps(result, prompt))
 
 
 def test_what_no_linear_fit_describes_keeps_the_deviations_of_its_steps():
