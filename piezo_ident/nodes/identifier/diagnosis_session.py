@@ -34,19 +34,31 @@ class DiagnosisSession:
         self.diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
         # the mark up to which samples went into the model, and cannot test it
         self._used: Mapping[str, int] = {}
+        # the identified model and its mark, also while a model file replaces them
+        self._own: tuple[StageModel | MultiAxisModel | None, Mapping[str, int]] = (None, {})
         self.drop()
 
-    def take(self, model: StageModel | MultiAxisModel, used: Mapping[str, int]) -> None:
+    def take(
+        self, model: StageModel | MultiAxisModel, used: Mapping[str, int], *, is_file: bool = False
+    ) -> None:
         """
         Take another model to diagnose.
 
         `used` is the `Capture.mark` up to which the capture served to identify the model.
         """
         self.model, self.diagnosis, self._used = model, None, used
+        if not is_file:
+            self._own = model, used
+
+    def leave_file(self) -> None:
+        """Take the identified model in place of the model of a file; without one, none."""
+        model, used = self._own
+        if self.model is not model:
+            self.model, self.diagnosis, self._used = model, None, used
 
     def forget(self) -> None:
         """Note that the capture was cleared."""
-        self._used = {}
+        self._used, self._own = {}, (self._own[0], {})
 
     def drop(self) -> None:
         """Give up the session under way."""

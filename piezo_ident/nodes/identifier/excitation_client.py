@@ -11,6 +11,7 @@ Otherwise the next ``~/start`` of a person would play the program of the identif
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 import math
 import time
@@ -25,6 +26,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+#: callback with None when a program was captured to its end, else with the reason
+Ended = Callable[[str | None], None]
 #: states of the excitation before the beginning and after the end of a program
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 #: state before the first status of this run; an older status is about an older run
@@ -68,15 +71,12 @@ class ExcitationClient:
     ) -> None:
         self._streams, self._missing = streams, missing
         self._begin: Callable[[], None] = _nothing
-        self._ended: Callable[[str | None], None] = _nothing
+        self._ended: Ended = _nothing
+        kinds = SetParameters, GetParameters, Trigger, Trigger
+        names = 'set_parameters', 'get_parameters', 'start', 'stop'
         self._set, self._get, self._start, self._stop = (
             node.create_client(kind, f'excitation/{name}', qos_profile=SERVICE)
-            for kind, name in (
-                (SetParameters, 'set_parameters'),
-                (GetParameters, 'get_parameters'),
-                (Trigger, 'start'),
-                (Trigger, 'stop'),
-            )
+            for kind, name in zip(kinds, names, strict=True)
         )
         node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
         node.create_subscription(DiagnosticStatus, 'stage/status', self._hear_stage, LATCHED)
@@ -87,6 +87,8 @@ class ExcitationClient:
         self._asked = 0.0
         # the earlier program of the excitation, until it is restored
         self._before: Any = None
+        #: start that was given up before its answer, which tells whether the program is this one's
+        self.left: Any = None
         self._looks = Looks()
         self._state, self._message, self._sent = '', '', 0
         self.progress = 0.0
@@ -122,11 +124,7 @@ class ExcitationClient:
         return bool(self._set.service_is_ready() and self._start.service_is_ready())
 
     def start(
-        self,
-        program: str,
-        limit: float,
-        ended: Callable[[str | None], None],
-        begin: Callable[[], None] | None = None,
+        self, program: str, limit: float, ended: Ended, begin: Callable[[], None] | None = None
     ) -> None:
         """
         Begin a run.
@@ -148,22 +146,32 @@ class ExcitationClient:
         self._phase, self._future, self.progress = 'finding', None, 0.0
         self._sign = time.monotonic()
 
-    def stop(self) -> bool:
-        """Give up the run; return whether the excitation was told to ramp to rest."""
-        is_started = self._phase in ('starting', 'playing') and self._stop.service_is_ready()
-        if is_started:
-            self._stop.call_async(Trigger.Request())
+    def stop(self) -> str:
+        """Give up the run; stop its program, but none of someone else; return what happens."""
         phase, self._phase = self._phase, ''
         if phase == 'starting' and self._future is not None:
-            # the excitation must begin with the program of the run first
-            self._future.add_done_callback(self._give_back)
-        elif phase in ('setting', 'starting'):
+            # an excitation that plays for someone else will refuse the start
+            self.left = self._future
+            self.left.add_done_callback(self._leave)
+            return 'the excitation ramps to rest if it has accepted the start'
+        self._give_back()
+        if phase == 'playing' and not (self._active and self._state in _RESTING):
+            self._stop.call_async(Trigger.Request())
+            return 'the excitation ramps to rest'
+        return f'the excitation {"is at rest" if phase == "playing" else "was not started"}'
+
+    def _leave(self, answer: Any = None) -> None:
+        """Stop the program of a start that was given up, unless the start was refused."""
+        if answer is None or answer is self.left:
+            self.left = None
+            if answer is None or answer.result().success:
+                self._stop.call_async(Trigger.Request())
             self._give_back()
-        return is_started
 
     def _give_back(self, *_: object) -> None:
         """Restore the earlier program of the excitation, unless another run is being started."""
-        if self._before is not None and self._phase not in ('setting', 'starting'):
+        busy = self.left is not None or self._phase in ('setting', 'starting')
+        if self._before is not None and not busy:
             self._set.call_async(_program(self._before))
             self._before = None
 
@@ -184,10 +192,8 @@ class ExcitationClient:
         if self._state not in _RESTING:
             # an older latched status says that the excitation is at rest
             self._active = True
-            try:
+            with suppress(ValueError):
                 self.progress = float(values.get('progress', '0'))
-            except ValueError:
-                pass
 
     def _hear_stage(self, message: DiagnosticStatus) -> None:
         text = {pair.key: pair.value for pair in message.values}.get('text', message.message)
@@ -198,6 +204,14 @@ class ExcitationClient:
         self._looks.look()
         if self._phase:
             getattr(self, f'_{self._phase}')()
+        elif self.left is not None and self._plays and self._looks.is_over(self._sign, _AGAIN):
+            # the answer is lost
+            self._leave()
+
+    @property
+    def _plays(self) -> bool:
+        """Whether the excitation has told since the start that it plays a program."""
+        return self._state not in (*_RESTING, _UNHEARD)
 
     @property
     def _patience(self) -> float:
@@ -264,8 +278,7 @@ class ExcitationClient:
         response = self._response('starting')
         if response is None:
             # The answer can be lost.  The excitation took the program, so it plays no other.
-            plays = self._state not in (*_RESTING, _UNHEARD)
-            if not (self.running and plays and self._looks.is_over(self._sign, _AGAIN)):
+            if not (self.running and self._plays and self._looks.is_over(self._sign, _AGAIN)):
                 return
             self._start.remove_pending_request(self._future)
         # an excitation that refuses plays a program of someone else, which must not be stopped
@@ -275,10 +288,11 @@ class ExcitationClient:
         if not success:
             self._end(f'the excitation does not start: {response.message}')
             return
+        self.left = None
         self._begin()
         self._sign = time.monotonic()
         # the status may have come before the answer
-        self._active = self._state not in (*_RESTING, _UNHEARD)
+        self._active = self._plays
 
     def _response(self, doing: str) -> Any:
         if self._future.done():

@@ -20,19 +20,11 @@ from piezo_ident.live.capture import Capture
 from piezo_ident.live.pacing import Rate
 from piezo_ident.model.axes_file import load
 from piezo_ident.model.multi_axis import each_of, EachAxis
+from piezo_ident.nodes.identifier import jobs
 from piezo_ident.nodes.identifier.diagnosis_session import DiagnosisSession
-from piezo_ident.nodes.identifier.excitation_client import ExcitationClient
+from piezo_ident.nodes.identifier.excitation_client import Ended, ExcitationClient
 from piezo_ident.nodes.identifier.inputs import Inputs
-from piezo_ident.nodes.identifier.jobs import (
-    DiagnosisOutcome,
-    IdentificationOutcome,
-    identify_capture,
-    percent_of,
-    save,
-    settings_of,
-    warm_up,
-    with_warnings,
-)
+from piezo_ident.nodes.identifier.jobs import DiagnosisOutcome, IdentificationOutcome
 from piezo_ident.nodes.identifier.worker import Worker
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.parameter_node import home_problem
@@ -61,7 +53,7 @@ class IdentifierNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self._capture = Capture(self.values['capture_limit'])
-        self._worker = Worker(self.values['nice'], warm_up)
+        self._worker = Worker(self.values['nice'], jobs.warm_up)
         self._outcomes: deque[Callable[[], None]] = deque()
         self._state, self._task, self._reported_at = 'idle', '', 0.0
         self._steps = Steps()
@@ -71,7 +63,7 @@ class IdentifierNode(LabNode):
         # mark of the capture that the running job uses, and the last published model
         self._using, self._published = dict[str, int](), ''
         if path := self.values['model']:
-            self._session.take(load(path), {})
+            self._session.take(load(path), {}, is_file=True)
         self._rate = Rate()
         self._model = self.create_publisher(String, 'model', LATCHED)
         self._report = self.create_publisher(String, 'report', LATCHED)
@@ -113,7 +105,7 @@ class IdentifierNode(LabNode):
         if self._excitation.running:
             # a run may end once all its blocks are captured
             self._drain()
-            self._excitation.poll()
+        self._excitation.poll()
         if waits_for := self._excitation.waits_for:
             # the capture is still the earlier one
             self._set_state('exciting', 0.0, f'{self._task}: {waits_for}')
@@ -151,18 +143,18 @@ class IdentifierNode(LabNode):
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse values that the settings would refuse later."""
         if name == 'thresholds':
-            settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
+            jobs.settings_of({**{d.name: d.default for d in NODES['identifier']}, name: value})
         if name == 'output':
             return 'output is blank; name a folder' if value.isspace() else home_problem(value)
         if name == 'channels' and (topics := list(filter(None, value))):
             return topics_problem(topics, name)
         if name.endswith('program') and not value.strip():
             return f'{name} must not be empty; name a program, a path, or write YAML'
-        if name == 'model' and value:
+        if name == 'model' and (value or self.values.get(name)):
             if self._is_busy():
                 return f'busy: {self._task}; set the model when that has ended, or call ~/cancel'
             try:
-                load(value)
+                load(value) if value else None
             except PiezoIdentError as error:
                 return f'model: {error}'
         return None
@@ -173,12 +165,14 @@ class IdentifierNode(LabNode):
             self._capture.limit = changed['capture_limit']
         if path := changed.get('model'):
             # some milliseconds; nothing is compiled before a diagnosis
-            self._session.take(load(path), {})
+            self._session.take(load(path), {}, is_file=True)
             self._published = ''
+        elif path is not None:
+            self._session.leave_file()
 
     def _run(self) -> str:
         self._refuse_when_busy()
-        settings_of(self.values)
+        jobs.settings_of(self.values)
         # older data may come from another stage, or another day
         about = 'program for the identification'
         self.excite(self.values['program'], about, self._run_ended, self._forget)
@@ -202,15 +196,9 @@ class IdentifierNode(LabNode):
                 'nothing has been captured; start the excitation, call ~/run, or replay a bag'
             )
         self._using = self._capture.mark()
-        job = functools.partial(
-            identify_capture,
-            self._capture.snapshot(),
-            settings_of(self.values),
-            which,
-            self._steps,
-            self._session.model,
-            self._axes,
-        )
+        snapshot, settings = self._capture.snapshot(), jobs.settings_of(self.values)
+        more = which, self._steps, self._session.model, self._axes
+        job = functools.partial(jobs.identify_capture, snapshot, settings, *more)
         self._task = 'identification' if which == 'all' else f'identification of the {which}'
         self._set_state('identifying', 0.0, f'{self._capture.seconds:.3g} s were captured')
         self._start(job)
@@ -229,14 +217,13 @@ class IdentifierNode(LabNode):
         check_folder(folder)
         self._task = 'saving'
         self._set_state('saving', 0.0, f'writing to {folder}')
-        self._start(functools.partial(save, identified, self._session.diagnosis, str(folder)))
+        self._start(functools.partial(jobs.save, identified, self._session.diagnosis, str(folder)))
         return f'writing to {folder}; see ~/status'
 
     def _cancel(self) -> str:
         if self._excitation.running:
-            ramps = self._excitation.stop()
+            text = self._excitation.stop()
             self._session.drop()
-            text = 'the excitation ramps to rest' if ramps else 'the excitation was not started'
             self._set_state('cancelled', 0.0, text)
             return f'cancelled; {text}'
         if not self._worker.is_busy:
@@ -265,11 +252,7 @@ class IdentifierNode(LabNode):
         return self._excitation.is_possible
 
     def excite(
-        self,
-        program: str,
-        why: str,
-        ended: Callable[[str | None], None],
-        begin: Callable[[], None] | None = None,
+        self, program: str, why: str, ended: Ended, begin: Callable[[], None] | None = None
     ) -> None:
         """Play a program; `ended` gets None for a complete capture, else the reason."""
         self._task = why
@@ -288,8 +271,8 @@ class IdentifierNode(LabNode):
         if outcome.model != (self._published or outcome.judged):
             self._publish_model(outcome.model)
         count = outcome.warnings
-        text = with_warnings('; '.join([outcome.message.rstrip('.'), *notes]), count)
-        level, brief = WARN if notes or count else OK, with_warnings(outcome.brief, count)
+        text = jobs.with_warnings('; '.join([outcome.message.rstrip('.'), *notes]), count)
+        level, brief = WARN if notes or count else OK, jobs.with_warnings(outcome.brief, count)
         figures = {**outcome.figures, 'warnings': count}
         self._set_state('done', 100.0, text, level, brief=brief, **figures)
 
@@ -304,7 +287,7 @@ class IdentifierNode(LabNode):
     def _progress(self, step: str, share: float) -> None:
         state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
         axes = ['y', *(f'y_{name}' for name in self._axes)]
-        percent = 100.0 * share if state == 'saving' else percent_of(step, share, axes)
+        percent = 100.0 * share if state == 'saving' else jobs.percent_of(step, share, axes)
         self.report_status(state, percent, step, brief=f'{percent:.0f} %: {step}')
 
     def _ended(self, result: Result | None, error: Exception | None) -> None:
@@ -336,7 +319,7 @@ class IdentifierNode(LabNode):
                     self.journal.tell(warning, WARN)
             level = WARN if result.warnings else OK
             text, brief = (
-                with_warnings(t, result.warnings) for t in (result.message, result.brief)
+                jobs.with_warnings(t, result.warnings) for t in (result.message, result.brief)
             )
             figures = {**result.figures, 'warnings': result.warnings}
             self._set_state('done', 100.0, text, level, brief=brief, **figures)
@@ -364,8 +347,10 @@ class IdentifierNode(LabNode):
 
     def close(self) -> None:
         """Cancel the work and have the excitation ramp to rest."""
-        if self._excitation.running:
-            self._excitation.stop()
+        self._excitation.stop()
+        if (start := self._excitation.left) is not None and self.executor is not None:
+            # the answer tells whether there is a program to stop
+            self.executor.spin_until_future_complete(start, PATIENCE)
         if self._worker.is_busy:
             self._worker.cancel()
             self._worker.join(PATIENCE)

@@ -11,8 +11,10 @@ import time
 from typing import Any
 
 from piezo_ident.common.errors import Cancelled, PiezoIdentError
-from piezo_ident.common.process import Job, WorkerProcess
+from piezo_ident.common.process import Job, Tick, WorkerProcess
 
+#: callback with the result of a job and None, or with None and its error
+Ended = Callable[[Any, Exception | None], None]
 #: time between two reports of progress [s]
 EVERY = 0.1
 
@@ -35,13 +37,7 @@ class Worker:
         """Whether a job runs."""
         return self._thread is not None and self._thread.is_alive()
 
-    def start(
-        self,
-        job: Job,
-        *,
-        progress: Callable[[str, float], None],
-        ended: Callable[[Any, Exception | None], None],
-    ) -> None:
+    def start(self, job: Job, *, progress: Tick, ended: Ended) -> None:
         """
         Start a job; see `piezo_ident.common.process.WorkerProcess.run`.
 
@@ -56,12 +52,7 @@ class Worker:
         )
         self._thread.start()
 
-    def _run(
-        self,
-        job: Job,
-        progress: Callable[[str, float], None],
-        ended: Callable[[Any, Exception | None], None],
-    ) -> None:
+    def _run(self, job: Job, progress: Tick, ended: Ended) -> None:
         last = 0.0
 
         def tick(step: str, share: float) -> None:

@@ -3,6 +3,7 @@
 
 """A diagnosis session without a graph: diagnose, request, diagnose again, conclude."""
 
+from dataclasses import replace
 import itertools
 
 from diagnosis_examples import example, measured
@@ -112,6 +113,26 @@ def test_what_the_model_was_made_from_does_not_judge_it(lab):
     assert given is slow_model() and asked == ('sweeps',)
     assert seconds == pytest.approx(measured().duration, abs=0.01)
     assert snapshot.record().n == measured().n
+
+
+def test_without_a_file_the_identified_model_is_judged_or_none():
+    lab = Lab()
+    lab.session.take(slow_model(), {}, is_file=True)
+    lab.session.leave_file()
+    with pytest.raises(PiezoIdentError, match='no model'):
+        lab.session.begin()
+    feed(lab.capture, measured())
+    own = replace(slow_model())
+    lab.session.take(own, lab.capture.mark())
+    lab.session.take(slow_model(), {}, is_file=True)
+    assert lab.session.seconds > 0.0
+    lab.session.leave_file()
+    # the data that the model was made from do not judge it
+    assert lab.session.model is own and lab.session.seconds == 0.0
+    # without a file there is none to leave
+    lab.session.diagnosis = 'kept'
+    lab.session.leave_file()
+    assert lab.session.diagnosis == 'kept'
 
 
 def test_it_judges_asks_judges_everything_and_concludes(lab):

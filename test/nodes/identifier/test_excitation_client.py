@@ -120,6 +120,69 @@ def test_the_excitation_gets_its_program_back(how):
     assert client.running == (how == 'started')
 
 
+def starting():
+    """Return a client whose start is not answered yet, with its node."""
+    node, nan = Node(0), float('nan')
+    client = ExcitationClient(node, lambda: Streams(0, nan, nan), lambda: '')
+    node.clients[2].dropped = 1
+    client.start('a program', 20.0, lambda reason: None)
+    for _ in range(4):
+        client.poll()
+    assert client.is_starting
+    return client, node
+
+
+def hear(client, state):
+    client._hear(DiagnosticStatus(values=[KeyValue(key='state', value=state)]))
+
+
+@pytest.mark.parametrize('accepted', [True, False])
+def test_a_cancel_before_the_answer_to_the_start_stops_no_program_of_others(accepted):
+    client, node = starting()
+    setter, _, starter, stopper = node.clients
+    # of this run or of somebody else: the answer tells
+    hear(client, 'running')
+    assert client.stop() == 'the excitation ramps to rest if it has accepted the start'
+    client.poll()
+    assert stopper.calls == 0 and not client.running
+    (asked,) = starter.waited_for
+    asked.set_result(Trigger.Response(success=accepted, message='somebody drives'))
+    assert stopper.calls == accepted
+    assert programs(setter) == ['a program', 'mine']
+    assert client.left is None and client.stop() == 'the excitation was not started'
+
+
+def test_a_cancelled_start_whose_answer_is_lost_is_stopped_once(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
+    client, node = starting()
+    setter, _, starter, stopper = node.clients
+    client.stop()
+    for state, stops in (('idle', 0), ('running', 1), ('running', 1)):
+        hear(client, state)
+        for _ in range(50):
+            clock[0] += 0.05
+            client.poll()
+        assert stopper.calls == stops
+    assert programs(setter) == ['a program', 'mine']
+    # a late answer stops nothing that somebody has started since
+    (asked,) = starter.waited_for
+    asked.set_result(Trigger.Response(success=True))
+    assert stopper.calls == 1
+
+
+def test_a_program_that_is_over_is_not_stopped():
+    client, node = starting()
+    _, _, starter, stopper = node.clients
+    (asked,) = starter.waited_for
+    asked.set_result(Trigger.Response(success=True))
+    client.poll()
+    hear(client, 'running')
+    hear(client, 'done')
+    assert client.running and client.stop() == 'the excitation is at rest'
+    assert stopper.calls == 0
+
+
 def test_a_start_whose_answer_is_lost_counts_once_the_excitation_plays(monkeypatch):
     monkeypatch.setattr(excitation_client, '_AGAIN', 0.01)
     node, ends, begun, nan = Node(0), [], [], float('nan')

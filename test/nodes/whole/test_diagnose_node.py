@@ -216,3 +216,7 @@ def test_a_model_file_can_be_judged_too(lab, tmp_path):
     lab.start('identifier', {'model': str(file), 'excitation_limit': 1.0}, 'alone')
     ok, reason = lab.call('alone/identifier/diagnose')
     assert not ok and 'nothing was captured' in reason
+    # an empty path takes the file away
+    assert lab.set('alone/identifier', 'model', '') == (True, '')
+    ok, reason = lab.call('alone/identifier/diagnose')
+    assert not ok and 'there is no model to diagnose' in reason
