@@ -14,6 +14,8 @@ import piezo_ident as pi
 from piezo_ident.identification.results import Identification
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.report import check_report_folder
+from piezo_ident.uncertainty.band import PredictionBand
+from piezo_ident.uncertainty.promises import with_band
 import pytest
 
 
@@ -93,6 +95,27 @@ def test_every_axis_is_predicted_and_those_with_a_displacement_are_compared(
     made = np.load(out)
     for axis in ('', '_b'):
         assert np.std(made[f'y_hat{axis}'] - raster[f'y{axis}']) < 4e-9
+
+
+@pytest.mark.parametrize('measured', [['y', 'y_b'], ['y_b'], []])
+def test_the_bands_of_all_axes_are_written_and_shown(capsys, folder, tmp_path, measured):
+    band = PredictionBand(np.array([1e-4, 1e-3, 1e-6, 0.0]), np.ones(4), 1e3)
+    axes = {axis: with_band(x, band) for axis, x in scanner().axes.items()}
+    pi.MultiAxisModel(axes).save(tmp_path / 'model.yaml')
+    raster, out = dict(np.load(folder / 'raster.npz')), tmp_path / 'out.npz'
+    part = {k: x for k, x in raster.items() if k[0] != 'y' or k in measured}
+    np.savez(tmp_path / 'part.npz', **part)
+    words = ['predict', tmp_path / 'model.yaml', tmp_path / 'part.npz', '--interval', '0.9']
+    words += ['--out', out, '--overwrite']
+    said = succeed(capsys, *words)
+    assert all(f'band at 90 %, axis {axis}: half width ' in said for axis in ('y', 'y_b'))
+    told = json.loads(succeed(capsys, *words, '--json'))['interval']['axes']
+    made = np.load(out)
+    for axis, tail in (('y', ''), ('y_b', '_b')):
+        half = made[f'half_width{tail}']
+        assert half.size == made['t'].size and half.min() > 0.0
+        share = 100.0 * half.mean() / abs(axes[axis].scaling.Y)
+        assert told[axis]['mean_half_width_percent_of_span'] == pytest.approx(share)
 
 
 def test_a_model_of_a_further_axis_alone_is_inverted(capsys, folder, tmp_path):
