@@ -104,7 +104,7 @@ def test_steps_alone_do_not_identify_hysteresis():
     played = stage.play(parse_program(text).build(20000.0), np.random.default_rng(1))
     steps = played.find('step')[0]
     record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
-    missing = dict(identify(record, Settings(max_order=4)).not_identified)
+    missing = dict(identify(record, Settings(max_order=4, thresholds=10)).not_identified)
     assert 'triangle' in missing['hysteresis']
 
 
