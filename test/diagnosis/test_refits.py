@@ -25,8 +25,6 @@ from programs import SLOW, slow_model
 import pytest
 
 CREEP = Added('creep', ({'gain': [0.01], 'time_constant': [0.5]},))
-LINE = {'frequency': 50.0, 'harmonic': [1.0], 'amplitude': [1e-4], 'phase': [0.0]}
-HUM = Added('periodic_disturbance', (LINE,))
 
 
 def without_labels() -> Record:

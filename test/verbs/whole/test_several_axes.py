@@ -167,10 +167,6 @@ def test_a_file_that_is_no_model_of_axes_is_refused_by_its_name(tmp_path, text, 
 ONE = chain([0.1, 0.1, 0.1], 0.5, 50e-6)
 
 
-def all_of(model, *axes):
-    return MultiAxisModel(dict.fromkeys(axes, model))
-
-
 @pytest.mark.parametrize(
     ('work', 'names'),
     [
