@@ -104,8 +104,8 @@ The sensor is cut off {rest:g} s after the change. Columns: error over the next 
 
 ## The claimed deviations
 
-Share of the errors within {nine} claimed standard deviations, in %: 90 % for a normal law. The error of a
-wrong gain or loop is never much larger than its rms, so nearly all of it lies within.
+Share of the errors within {nine} claimed standard deviations, in %: 90 % for a normal law.
+The error of a wrong gain or loop is never much larger than its rms: nearly all lies within.
 
 {claims}
 

@@ -112,9 +112,11 @@ def errors_of(
             ):
                 if mask.any():
                     y = piece.y[mask]
-                    both = (percent_of_stroke(y, x[mask], stroke) for x in (p.y_hat, p.y_static))
+                    whole, static = (
+                        percent_of_stroke(y, x[mask], stroke) for x in (p.y_hat, p.y_static)
+                    )
                     fit = fit_percent(y, p.y_hat[mask])
-                    rows.append(ErrorRow(p.run.record, label, *both, fit, y.size, data))
+                    rows.append(ErrorRow(p.run.record, label, whole, static, fit, y.size, data))
     return rows
 
 

@@ -131,16 +131,16 @@ def settings_of(values: dict[str, object]) -> Settings:
 
     ConfigError when a value is out of range.
     """
-    same = {
-        k: int(str(values[k])) for k in ('max_order', 'swarm_size', 'swarm_iterations', 'seed')
-    }
     delay = int(str(values['delay']))
     return Settings(
-        **same,
         thresholds=int(str(values['thresholds'])) or None,
         solver=str(values['solver']),  # type: ignore[arg-type]
         polish=values['solver'] == 'swarm' and bool(values.get('polish')),
+        max_order=int(str(values['max_order'])),
         delay=None if delay < 0 else delay,
+        swarm_size=int(str(values['swarm_size'])),
+        swarm_iterations=int(str(values['swarm_iterations'])),
+        seed=int(str(values['seed'])),
     )
 
 
