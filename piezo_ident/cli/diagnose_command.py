@@ -78,9 +78,7 @@ def diagnose_command(args: SimpleNamespace, console: Console) -> None:
     )
 
 
-def _of_each(
-    diagnosis: Diagnosis | EachAxis[Diagnosis],
-) -> list[tuple[dict[str, str], Diagnosis]]:
+def _of_each(diagnosis: Diagnosis | EachAxis[Diagnosis]) -> list[tuple[dict[str, str], Diagnosis]]:
     """List the diagnoses; with several axes, each with the name of its axis."""
     if isinstance(diagnosis, EachAxis):
         return [({'axis': axis}, x) for axis, x in diagnosis.items()]

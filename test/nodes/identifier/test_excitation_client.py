@@ -185,6 +185,8 @@ def test_a_program_that_is_over_is_not_stopped():
 
 def test_a_start_whose_answer_is_lost_counts_once_the_excitation_plays(monkeypatch):
     monkeypatch.setattr(excitation_client, '_AGAIN', 0.01)
+    clock = [100.0]
+    monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
     node, ends, begun, nan = Node(0), [], [], float('nan')
     client = ExcitationClient(node, lambda: Streams(0, nan, nan), lambda: '')
     setter, _, starter, _ = node.clients
@@ -192,10 +194,9 @@ def test_a_start_whose_answer_is_lost_counts_once_the_excitation_plays(monkeypat
     client.start('a program', 20.0, ends.append, lambda: begun.append(True))
 
     def go_on():
-        until = time.monotonic() + 0.05
-        while time.monotonic() < until:
+        for _ in range(50):
+            clock[0] += 0.001
             client.poll()
-            time.sleep(0.001)
 
     go_on()
     assert client.is_starting and not begun
