@@ -10,19 +10,18 @@ seconds before.  The node joins the reference from rest along a raised cosine.  
 is silent for `silence`, the node plays its remaining part and ramps to rest.  ``~/stop``, SIGINT
 and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
 
-``~/learn`` repeats the last reference, corrects the voltage by the measured error, and ends when
-the error stops falling.  A further call goes on from the best repetition.
+``~/learn`` repeats the last reference, and corrects the voltage by the measured error, until the
+error stops falling.  A further call goes on from the best repetition.
 
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
-axes do to one another; modes that they share are inverted for all axes together.  A block of
-`reference` waits up to `PATIENCE` for the blocks of the other axes at the same t.  An axis without
-a reference stays at rest.  Another model waits until the next ``~/start`` or ``~/learn``.
+axes do to one another; shared modes are inverted for all axes together.  A block of `reference`
+waits up to `PATIENCE` for those of other axes at the same t; an axis without a reference rests.
+Another model waits until the next ``~/start`` or ``~/learn``.
 
 With `follow` an observer of each axis finds offset, creep of earlier motion, and gain in its
 displacement, and the node corrects the voltage by them.
-
-A refined model takes over while the stage moves.  The voltage does not step, and the model has the
-memory that it would have if it had run from the start.
+A refined model takes over while the stage moves, with the memory of a run from the start.  The
+voltage does not step.
 
 | in the reference | what happens | status |
 |---|---|---|
