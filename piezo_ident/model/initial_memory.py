@@ -32,8 +32,8 @@ An offset moves the whole early part, but a play moves it only until the voltage
 The priors of this fit are weak.  With the sizes, zeros and correlated error of the observer as
 priors, and with a misfit of H that the motion repeats, creep errs 0.9 times as much if the memory
 is known, and 1.0 times if it is not (0.4 to 1.4 and 0.4 to 2.2, 10th and 90th percentile, behind
-the early part of 60 records of four stages of other laws).  That is no better, and three of 24
-shifted zeros then count as creep.
+the early part of 60 records of four stages of other laws).  That is no better, and three of twelve
+shifted zeros of a stage at rest then count as creep.
 """
 
 from __future__ import annotations
