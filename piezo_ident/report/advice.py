@@ -23,6 +23,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.record import Piece, Record
 from piezo_ident.report.html import Step
 from piezo_ident.report.table import listed, number
+from piezo_ident.uncertainty.parameters import CLOSED
 from scipy.signal import correlate
 
 #: an error of at most this many times the sensor noise leaves little to find
@@ -103,7 +104,7 @@ def _after_identification(result: Identification, prompt: Prompt) -> Iterator[St
     is_validated = errors.data == 'validation'
     times = math.inf if not floor else errors.percent / floor
     # a loop that no play opens needs more thresholds, not another record
-    missing = [what for what, _ in result.not_identified if 'loop' not in what]
+    missing = [what for what, why in result.not_identified if why != CLOSED]
     if missing:
         reason = f'{listed(missing)}: not identified'
         yield _experiment(reason, 'identification', result.model, prompt)

@@ -78,7 +78,7 @@ def with_deviations(result: Identification, judged: Judged) -> Identification:
     off = np.array([x[: len(rows)] - at[: len(rows)] for x in (at, *others)])
     std = np.hypot(std, np.sqrt(np.mean(off**2, axis=0)))
     # a mode that replicates or other orders lack is unknown, and so is a loop that no play opens
-    closed = (at[: len(rows)] == 0.0) & (std == 0.0)
+    closed = np.array([row.part == 'H' and row.value == 0.0 for row in rows]) & (std == 0.0)
     told = np.where(np.isfinite(std) & ~closed, std, np.inf)
     quantities = [asdict(replace(row, std=float(s))) for row, s in zip(rows, told, strict=True)]
     missing = (*result.not_identified, *((rows[i].name, CLOSED) for i in np.flatnonzero(closed)))

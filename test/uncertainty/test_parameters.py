@@ -18,6 +18,7 @@ from piezo_ident.model.front_door import ModelParameter
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.play import play_columns
 from piezo_ident.record.record import Record
+from piezo_ident.uncertainty import parameters
 from piezo_ident.uncertainty.parameters import (
     BLOCKS,
     linearised,
@@ -154,6 +155,14 @@ def test_a_loop_narrower_than_every_play_is_not_identified():
     # more of the same motion would not help
     prompt = report.Prompt('model.yaml', '', {'record': 'record.npz'})
     assert not any('loop' in step.reason for step in report.next_steps(result, prompt))
+
+
+def test_a_share_of_creep_at_its_bound_is_no_closed_loop(monkeypatch):
+    own, share = parameters._quantities, ModelParameter('creep', 'gain at 1 s', 0.0, '')
+    monkeypatch.setattr(parameters, '_quantities', lambda *given: [*own(*given), share])
+    result = with_deviations(*identified())
+    assert result.model.quantities[-1].std == 0.0
+    assert result.not_identified == deviating().not_identified
 
 
 def test_what_no_linear_fit_describes_keeps_the_deviations_of_its_steps():
