@@ -287,10 +287,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
                 os.environ.setdefault(name, '1')
         # imports the modules of this verb alone
-        module = f'piezo_ident.cli.{HOMES.get(args.verb, args.verb)}_command'
-        command = getattr(importlib.import_module(module), f'{args.verb}_command')
-        with (console := Console(args.json)).notices():
-            command(args, console)
+        home = HOMES.get(args.verb, args.verb)
+        module = importlib.import_module(f'piezo_ident.cli.{home}_command')
+        console = Console(args.json)
+        with console.notices():
+            getattr(module, f'{args.verb}_command')(args, console)
         sys.stdout.flush()
         if argv is None:
             # all is written; an interrupt while the interpreter ends would print a traceback

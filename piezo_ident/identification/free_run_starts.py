@@ -212,7 +212,9 @@ class Search:
         return best if known is free else known
 
     def _orders(self, alone: Fit) -> list[Candidate]:
-        candidates = [self._candidate('hysteresis', alone)]
+        # an order that is given decides against H alone
+        is_given = self.allowed.order is not None
+        candidates = [] if is_given else [self._candidate('hysteresis', alone)]
         rough = [alone, *self._rough([s.u for s in self.stretches], None)]
         rough += self._rough(self._inputs(alone.stage), alone.stage)
         first = min(rough, key=lambda one: one.loss)
@@ -220,14 +222,11 @@ class Search:
         for (na, _), (d, G) in sorted(starts.items()):
             one = self._fit(_with_dynamics(first.stage, d, G), MANY)
             candidates.append(self._candidate(f'order {na}', one))
-        if self.allowed.order is not None:
-            # the user has chosen against H alone
-            del candidates[0]
-            if not candidates:
-                raise IdentificationError(
-                    f'order: least squares finds no stable G of order {self.allowed.order} in the '
-                    'fitted parts; record longer, or give another order (--order) or none'
-                )
+        if not candidates:
+            raise IdentificationError(
+                f'order: least squares finds no stable G of order {self.allowed.order} in the '
+                'fitted parts; record longer, or give another order (--order) or none'
+            )
         return candidates + self._later(best_of(candidates))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:

@@ -241,11 +241,18 @@ class Observer:
             meanwhile()
             time.sleep(0.01)
 
-    def until(self, name: str, *states: str, since: int = 0, timeout: float = LIMIT) -> Any:
-        """Wait for a state of a node after so many statuses, and return the status then."""
+    def until(
+        self, name: str, *states: str, since: int = 0, after: str = '', timeout: float = LIMIT
+    ) -> Any:
+        """
+        Wait for a state of a node after so many statuses, and return the status then.
+
+        The node first leaves the state `after`, if that is given.
+        """
 
         def found() -> list[dict[str, str]]:
-            return [s for s in self.statuses(name)[since:] if s['state'] in states]
+            later = dropwhile(lambda s: s['state'] == after, self.statuses(name)[since:])
+            return [s for s in later if s['state'] in states]
 
         self.wait(found, f'{name} to be {" or ".join(states)}', timeout)
         return found()[0]
@@ -256,15 +263,8 @@ class Observer:
         before, since = self.status(name)['state'], len(self.statuses(name))
         accepted, reason = self.call(service)
         assert accepted, reason
-        wanted = states or ENDS
-
-        def ends() -> list[dict[str, str]]:
-            # a node repeats its status each second, also while the call is on its way
-            begun = dropwhile(lambda s: s['state'] == before, self.statuses(name)[since:])
-            return [s for s in begun if s['state'] in wanted]
-
-        self.wait(ends, f'{name} to be {" or ".join(wanted)}', timeout)
-        return ends()[0]
+        # a node repeats its status each second, also while the call is on its way
+        return self.until(name, *(states or ENDS), since=since, after=before, timeout=timeout)
 
     # acting
 

@@ -72,11 +72,14 @@ class ExcitationClient:
         self._streams, self._missing = streams, missing
         self._begin: Callable[[], None] = _nothing
         self._ended: Ended = _nothing
-        kinds = SetParameters, GetParameters, Trigger, Trigger
-        names = 'set_parameters', 'get_parameters', 'start', 'stop'
         self._set, self._get, self._start, self._stop = (
             node.create_client(kind, f'excitation/{name}', qos_profile=SERVICE)
-            for kind, name in zip(kinds, names, strict=True)
+            for kind, name in (
+                (SetParameters, 'set_parameters'),
+                (GetParameters, 'get_parameters'),
+                (Trigger, 'start'),
+                (Trigger, 'stop'),
+            )
         )
         node.create_subscription(DiagnosticStatus, 'excitation/status', self._hear, LATCHED)
         node.create_subscription(DiagnosticStatus, 'stage/status', self._hear_stage, LATCHED)

@@ -154,7 +154,8 @@ class IdentifierNode(LabNode):
             if self._is_busy():
                 return f'busy: {self._task}; set the model when that has ended, or call ~/cancel'
             try:
-                load(value) if value else None
+                if value:
+                    load(value)
             except PiezoIdentError as error:
                 return f'model: {error}'
         return None
