@@ -12,6 +12,7 @@ motions that were not fitted: sines v = 5 + 5 sin(2 pi f t) in steady state, and
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
 from pathlib import Path
 import platform
@@ -122,6 +123,9 @@ The second stage has 40 thresholds that are none of the model's. % of stroke.
 
 def main() -> None:
     """Write the study to the file named on the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('out', type=Path)
+    out = parser.parse_args().out
     paper, dense = (SimulatedStage.load(name) for name in ('paper', 'dense'))
     stages = {'paper (flattering)': paper, '40 thresholds off the grid': dense}
     text = TEXT.format(
@@ -131,7 +135,7 @@ def main() -> None:
         noise=paper.sensor.noise_rms / abs(paper.model.scaling.Y),
         thresholds=thresholds_table(stages),
     )
-    Path(sys.argv[1]).write_text(text, encoding='utf-8')
+    out.write_text(text, encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -23,8 +23,12 @@ from .motion import POORER
 from .table import EFFECTS, OUTSIDE
 
 #: of the stages that are sums of plays, and the first of twenty seeds of those without an effect;
-#: nobody looked at those of `sums` before they were judged
-SUM_SEEDS = {'sums': ((21, 22, 23), 41), 'first-sums': ((1, 2, 3), 1)}
+#: nobody looked at those of `sums` and `next-sums` before they were judged
+SUM_SEEDS = {
+    'sums': ((21, 22, 23), 41),
+    'first-sums': ((1, 2, 3), 1),
+    'next-sums': ((31, 32, 33), 71),
+}
 COLOURS = ('white', '1/f', '10-bit')
 PAIRS = (
     ('creep', 'rate_dependent_hysteresis'),
