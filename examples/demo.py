@@ -25,7 +25,6 @@ import time
 from demo_page import Motion, MOTIONS, Session, STAGE, write_page
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.model.observer import observe
 from tqdm import tqdm
 
 try:
@@ -106,8 +105,7 @@ def offline(out: Path, progress: Progress) -> Session:
 def _motion(model: pi.StageModel, record: pi.Record) -> Motion:
     run = pi.free_run(model, record)
     t, v = (np.concatenate([getattr(piece, name) for piece in record]) for name in ('t', 'v'))
-    estimate = np.concatenate([observe(model, piece).estimate for piece in record])
-    return Motion(t, v, run.measured, run.predicted, estimate)
+    return Motion(t, v, run.measured, run.predicted, np.concatenate(run.estimate))
 
 
 def main() -> int:

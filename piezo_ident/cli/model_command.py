@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 from pathlib import Path
@@ -81,6 +81,7 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
     known = [axis for axis in models_of(model) if is_measured(record, axis)]
     pieces: dict[str, Sequence[Array]] = {}
     halves: dict[str, Sequence[Array]] = {}
+    runs: Mapping[str, FreeRun] = {}
     run: FreeRun | EachAxis[FreeRun] | None = None
     if known:
         with naming(str(args.model)):
@@ -125,6 +126,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
                 if (v := voltage_of(axis)) != 'v':
                     columns[v] = [piece.channels[v] for piece in record]
                 columns[f'y_hat{axis[1:]}'] = parts
+                if axis in runs:
+                    columns[f'estimate{axis[1:]}'] = runs[axis].estimate
                 if args.interval:
                     columns[f'half_width{axis[1:]}'] = halves[axis]
             _write_prediction(record, columns, args.out)
@@ -134,12 +137,8 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
 
 def _write_prediction(record: Record, columns: Mapping[str, Sequence[Array]], path: Path) -> None:
     blocks = blocks_of(record, **columns)
-
-    def known() -> Iterator[dict[str, Array]]:
-        for block in blocks():
-            yield {k: x for k, x in block.items() if k != 'y' or record.is_measured}
-
-    write_columns(path, known)
+    left_out = () if record.is_measured else ('y',)
+    write_columns(path, lambda: ({k: b[k] for k in b if k not in left_out} for b in blocks()))
 
 
 def print_bands(

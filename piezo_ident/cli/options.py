@@ -188,7 +188,7 @@ OUTPUT = [
 ]
 
 PREDICT = [
-    _output('--out', 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat.'),
+    _output('--out', 'OUT', 'Table .csv or .npz with the columns t, v, y, y_hat, estimate.'),
     _output('--plot', 'PICTURE', 'Picture of measured and predicted.'),
     _option(
         '--interval',

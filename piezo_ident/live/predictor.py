@@ -19,6 +19,7 @@ from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import BlockClock, Kind
 from piezo_ident.model.axis_records import motion_of
+from piezo_ident.model.estimate import observe
 from piezo_ident.model.modes.stream import ModesRun
 from piezo_ident.model.multi_axis import (
     alone,
@@ -27,7 +28,6 @@ from piezo_ident.model.multi_axis import (
     MultiAxisModel,
     require_voltages_only,
 )
-from piezo_ident.model.observer import observe
 from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream

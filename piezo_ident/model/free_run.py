@@ -18,6 +18,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, CHUNK
 from piezo_ident.common.errors import expect, ModelError
 from piezo_ident.common.showable import Showable
+from piezo_ident.model.estimate import observe_pieces
 from piezo_ident.model.initial_memory import crept, EARLY, early_part, fit_start
 from piezo_ident.model.metrics import doubts, nrmse_fit, percent
 from piezo_ident.model.stage_model import StageModel
@@ -90,6 +91,11 @@ class FreeRun(Showable):
         Level of the band; None without a band.
     half_widths : tuple of ndarray
         Half width of the band of each piece [m], infinite where nothing is known.
+    estimate : tuple of ndarray
+        Displacement of each piece by an observer, from rest and displacement that is at least
+        `piezo_ident.model.observer.HORIZON` samples older [m]; the model node gives the same.
+    errors_of_estimate : FreeRunErrors or None
+        Errors of `estimate` over all samples; None without an estimate.
 
     Examples
     --------
@@ -110,6 +116,8 @@ class FreeRun(Showable):
     warnings: tuple[str, ...] = ()
     interval: float | None = None
     half_widths: tuple[Array, ...] = ()
+    estimate: tuple[Array, ...] = ()
+    errors_of_estimate: FreeRunErrors | None = None
 
     @property
     def inside(self) -> float:
@@ -173,6 +181,29 @@ def compared(
         errors_after_start=_errors(record, predicted, late) if _judged(record, late) else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
+
+
+def with_estimate(run: FreeRun, alone: StageModel, *, coupled: bool = False) -> FreeRun:
+    """
+    Add the estimate of an observer to a run.
+
+    `alone` is the model that the observer corrects.  `coupled` says whether the model of the run
+    adds the motion by other axes to that of `alone`.
+    """
+    record, groups = run.record, connected_pieces(run.record)
+    rest, at_rest = list(run.pieces), [None] * len(groups)
+    if any(run.estimated):
+        rest = _predicted(run.model, record, groups, at_rest)
+    felt = [np.zeros(y.size) for y in rest]
+    if coupled:
+        own = _predicted(alone, record, groups, at_rest)
+        felt = [y - y_own for y, y_own in zip(rest, own, strict=True)]
+    estimate: list[Array] = []
+    for pieces in groups:
+        cut = slice(len(estimate), len(estimate) + len(pieces))
+        estimate += [one.estimate for one in observe_pieces(alone, pieces, rest[cut], felt[cut])]
+    errors = _errors(record, estimate, [0] * len(estimate))
+    return replace(run, estimate=tuple(estimate), errors_of_estimate=errors)
 
 
 def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:

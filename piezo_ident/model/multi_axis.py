@@ -183,9 +183,7 @@ class MultiAxisModel:
 
     def own(self, axis: str) -> StageModel:
         """Take the paths of the other axes out of the model of an axis."""
-        model = self.axes[axis]
-        kept = tuple(e for e in model.effects if not e.channel.startswith(MOTION))
-        return replace(model, effects=kept)
+        return without_other_axes(self.axes[axis])
 
     def require_chains(self, verb: str) -> None:
         """Refuse a model with shared modes for a verb that runs chains alone."""
@@ -324,6 +322,12 @@ def require_voltages_only(model: StageModel | MultiAxisModel) -> None:
                 f'effect {effect.name} needs the further channel {effect.channel!r}, which '
                 'does not come with the voltage; take the effect out of the model'
             )
+
+
+def without_other_axes(model: StageModel) -> StageModel:
+    """Take the paths of other axes out of the model of an axis."""
+    kept = tuple(e for e in model.effects if not e.channel.startswith(MOTION))
+    return replace(model, effects=kept)
 
 
 def alone(model: StageModel | MultiAxisModel) -> Mapping[str, StageModel]:

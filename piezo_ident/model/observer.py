@@ -46,7 +46,6 @@ doi:10.1109/TAC.1965.1098191.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -57,7 +56,6 @@ from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block
-from piezo_ident.record.record import Piece
 
 #: age of the displacement that corrects an estimate [samples]: a block
 HORIZON = 100
@@ -349,30 +347,3 @@ class Observer:
             band=abs(Y) * band,
             fading=Y * self._state.coming,
         )
-
-
-def observe(model: StageModel, piece: Piece, horizon: int = HORIZON, **options: Any) -> Observed:
-    """
-    Run an observer along a piece of a record; NaN and infinite readings count as missing.
-
-    Parameters
-    ----------
-    model : StageModel
-    piece : Piece
-    horizon : int, optional
-        As for `Observer`; `options` are its other parameters.
-
-    Examples
-    --------
-    >>> import piezo_ident as pi
-    >>> stage = pi.SimulatedStage.load('paper')
-    >>> (piece,) = stage.play(pi.Program.load('minor_loops'))
-    >>> moved = Piece(piece.v, piece.y + 1e-6, piece.sample_rate)
-    >>> seen = observe(stage.model, moved)
-    >>> f'{1e6 * seen.offset[-1]:.2f} um'
-    '1.00 um'
-    """
-    model.check_rate(piece)
-    y = np.concatenate([np.full(horizon, np.nan), piece.y])[: piece.n]
-    observer = Observer(model, horizon=horizon, **options)
-    return observer.process(piece.v, model.stream().follow(piece), y)

@@ -92,12 +92,13 @@ def _record(record: Record) -> dict[str, Any]:
 
 
 def _free_run(run: FreeRun) -> dict[str, Any]:
-    late = run.errors_after_start
+    late, estimate = run.errors_after_start, run.errors_of_estimate
     return {
         'record': run.record.name,
         'formula': metrics.FORMULA,
         'whole': _free_run_errors(run.errors),
         'start_forgotten': None if late is None else _free_run_errors(late),
+        'estimate': None if estimate is None else _free_run_errors(estimate),
         'memory_estimated': list(run.estimated),
         'share_inside_band': None if run.interval is None else run.inside,
         'warnings': list(run.warnings),

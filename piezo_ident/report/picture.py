@@ -15,6 +15,7 @@ from piezo_ident.common.files import temporary_output
 from piezo_ident.model.free_run import FreeRun, PieceRun
 from piezo_ident.model.metrics import expected_error, FORMULA, worst_error
 from piezo_ident.model.multi_axis import EachAxis, files_of
+from piezo_ident.model.observer import HORIZON
 from piezo_ident.record.record import Record
 from piezo_ident.report.html import Shown, summary_html
 from piezo_ident.report.table import length, number, plain_text, Table
@@ -204,6 +205,9 @@ def _free_run(result: FreeRun) -> tuple[str, Table]:
             zero = ': the sensor was set to zero elsewhere' if e.only_offset else ''
             left = f'{number(e.percent_without_offset)} % after removing a mean of'
             rows.append(('', f'{left} {length(e.offset)}{zero}'))
+    if (seen := result.errors_of_estimate) is not None:
+        how = f'from displacement {HORIZON} samples before'
+        rows.append(('estimate', f'{number(seen.percent)} % of stroke, {how}'))
     if result.interval is not None:
         half = np.concatenate(result.half_widths)
         half = half[np.isfinite(half)]

@@ -12,11 +12,17 @@ from typing import overload
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.model.axis_records import axis_record, is_measured
-from piezo_ident.model.free_run import compared, FreeRun
+from piezo_ident.model.free_run import compared, FreeRun, with_estimate
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import predict as predict_axis
 from piezo_ident.model.initial_memory import unknown_starts
-from piezo_ident.model.multi_axis import EachAxis, models_of, MultiAxisModel
+from piezo_ident.model.multi_axis import (
+    alone,
+    EachAxis,
+    models_of,
+    MultiAxisModel,
+    without_other_axes,
+)
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.faults import without_faults
 from piezo_ident.record.record import Record
@@ -50,11 +56,14 @@ def free_run(
     its early part.  A model with creep also gets the creep from earlier motion if the early part
     shows it.  Later samples are predicted without a fit.
 
+    An observer estimates the displacement, too, as the model node does live: from rest, and from
+    displacement that is at least 100 samples older.
+
     Parameters
     ----------
     model : StageModel or MultiAxisModel
     record : Record
-        The displacement serves only for this estimate and for the errors.
+        The displacement serves only for the start, the estimate and the errors.
     interval : float, optional
         Level of a band of the error, for example 0.9; see `piezo_ident.uncertainty.band`.
     axes : collection of str, optional
@@ -93,7 +102,9 @@ def free_run(
             f'{", ".join(known)}'
         )
     if not isinstance(model, MultiAxisModel):
+        own_motion = without_other_axes(model)
         run = run_axis(model, record)
+        run = with_estimate(run, own_motion, coupled=own_motion.effects != model.effects)
         if interval is None:
             return run
         own = half_widths(model, run.record, run.pieces, interval, run.estimated)
@@ -115,6 +126,8 @@ def free_run(
             axis: compared(model.axes[axis], without_faults(one), predicted[axis], late)
             for axis, one in kept.items()
         }
+        single = alone(model)
+        runs = {a: with_estimate(x, single[a]) for a, x in runs.items()}
         if interval is not None:
             half = modes_half_widths(model, model.modes, seen, predicted, interval)
             runs = {a: with_half_widths(x, interval, half[a]) for a, x in runs.items()}

@@ -172,13 +172,16 @@ def test_identify_finds_the_stage_and_predict_confirms_it(capsys, tmp_path, made
     assert 'rms(y - y_hat)' in text
     assert picture.read_bytes().startswith(b'\x89PNG')
     table = columns_of(out)
-    assert [*table] == ['t', 'v', 'y', 'y_hat']
+    assert [*table] == ['t', 'v', 'y', 'y_hat', 'estimate']
     piece = pi.read(made / 'sine.csv').pieces[0]
     np.testing.assert_array_equal(table['y'], piece.y)
     np.testing.assert_array_equal(table['y_hat'], model.predict_piece(piece))
     data = json.loads(succeed(capsys, *argv[:3], '--json', '--out', tmp_path / 'y.npz'))
     error = 100 * np.sqrt(np.mean((table['y'] - table['y_hat']) ** 2)) / np.ptp(table['y'])
     assert data['whole']['percent_of_stroke'] == pytest.approx(error, rel=1e-9)
+    left = 100 * np.sqrt(np.mean((table['y'] - table['estimate']) ** 2)) / np.ptp(table['y'])
+    assert data['estimate']['percent_of_stroke'] == pytest.approx(left, rel=1e-9)
+    assert 'estimate   ' in text and 'displacement 100 samples before' in text
     # thresholds of the truth lie on the grid of the fit, so little but noise is left
     assert error < 0.2
     assert data['memory_estimated'] == [False]

@@ -9,15 +9,16 @@ import itertools
 import numpy as np
 from numpy.testing import assert_allclose
 from paper_stage import FS, PAPER
+import piezo_ident as pi
 from piezo_ident.common.errors import DataError
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.monitor import Matcher
 from piezo_ident.live.predictor import Predictor
-from piezo_ident.model.observer import observe
+from piezo_ident.model.estimate import observe
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.blocks import Samples
-from piezo_ident.record.record import Piece
+from piezo_ident.record.record import Piece, Record
 import pytest
 
 MODEL = replace(PAPER, identification={'errors': {'held_out': 0.01}})
@@ -125,6 +126,21 @@ def test_a_gap_of_voltage_and_a_restart_keep_it_going(missing):
     assert t.size == N - min(missing, 4000) + 4100
     assert np.isfinite(y).all()
     assert np.abs(y[-2000:] - Y[2100:4100]).max() < 2e-7
+
+
+def test_a_record_with_a_gap_and_left_out_readings_gives_the_same():
+    line, cuts, lost = Line(), (slice(0, 3100), slice(3300, N)), slice(5000, 5040)
+    for k in [k for k in range(0, N, 100) if not 3100 <= k < 3300]:
+        line.voltage(slice(k, k + 100))
+        line.displacement(slice(k, k + 100), np.where(np.arange(N) // 40 == 125, np.nan, Y))
+    sound = np.ones(N, dtype=bool)
+    sound[lost] = False
+    pieces = [Piece(V[c], Y[c], FS, start_time=T[c][0], sound=sound[c]) for c in cuts]
+    run = pi.free_run(MODEL, Record(tuple(pieces), 'gap'))
+    t, y = line.rows
+    assert t.size == N - 200
+    assert_allclose(y, np.concatenate(run.estimate), rtol=0, atol=1e-12 * 75e-6)
+    assert run.errors_of_estimate.percent < 0.2 * run.errors.percent
 
 
 def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from paper_stage import FS, PAPER
 from piezo_ident.common.errors import DataError
+from piezo_ident.model.estimate import observe
 from piezo_ident.model.initial_memory import creep_elements
 from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.observer import (
@@ -18,7 +19,6 @@ from piezo_ident.model.observer import (
     DRIFT_TIME,
     GAIN_SIZE,
     GAIN_WALK,
-    observe,
     Observer,
     PATH,
     WALK,

@@ -14,8 +14,8 @@ import piezo_ident as pi
 from piezo_ident.live.comparison import AxisComparison
 from piezo_ident.live.corrector import Corrector
 from piezo_ident.live.predictor import Predictor
+from piezo_ident.model.estimate import observe
 from piezo_ident.model.multi_axis import alone, with_own
-from piezo_ident.model.observer import observe
 from piezo_ident.record.blocks import Samples
 from piezo_ident.record.record import Piece
 import pytest
@@ -113,12 +113,18 @@ def test_an_estimate_is_that_of_the_axis_alone_and_what_it_feels(options):
     plays = ((50, 3), (77, 3), (50, 0))
     estimates = [Live(model, **options).play(v, y, size, late) for size, late in plays]
     free, own = answer(model, v), alone(model)
+    channels = {'v_b': v[1], 'y_b': y[1]}
+    record = pi.Record.from_arrays(T, v[0], y[0], channels=channels)
+    offline = pi.free_run(model, record)
     for k, axis in enumerate(AXES):
         felt = free[k] - own[axis].simulate(v[k])
         assert np.ptp(felt) > 5e-3 * np.ptp(free[k])
         expected = observe(own[axis], Piece(v[k], y[k] - felt, RATE), **options).estimate + felt
         for estimate in estimates:
             assert_allclose(estimate[k], expected, rtol=0, atol=1e-12 * 50e-6)
+        if not options:
+            seen = np.concatenate(offline[axis].estimate)
+            assert_allclose(seen, expected, rtol=0, atol=1e-12 * 50e-6)
 
 
 def test_a_gain_is_told_of_the_axis_and_not_of_what_it_feels():

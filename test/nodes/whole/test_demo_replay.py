@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 import piezo_ident as pi
-from piezo_ident.model.observer import observe
+from piezo_ident.model.estimate import observe
 from processes import take_domain
 
 ROOT = Path(__file__).resolve().parents[3]
