@@ -102,8 +102,8 @@ def free_run(
             f'{", ".join(known)}'
         )
     if not isinstance(model, MultiAxisModel):
-        own_motion = without_other_axes(model)
         run = run_axis(model, record)
+        own_motion = without_other_axes(model)
         run = with_estimate(run, own_motion, coupled=own_motion.effects != model.effects)
         if interval is None:
             return run
