@@ -126,10 +126,9 @@ def predict_command(args: SimpleNamespace, console: Console) -> None:
                 if (v := voltage_of(axis)) != 'v':
                     columns[v] = [piece.channels[v] for piece in record]
                 columns[f'y_hat{axis[1:]}'] = parts
-                if axis in runs:
-                    columns[f'estimate{axis[1:]}'] = runs[axis].estimate
                 if args.interval:
                     columns[f'half_width{axis[1:]}'] = halves[axis]
+            columns |= {f'estimate{axis[1:]}': x.estimate for axis, x in runs.items()}
             _write_prediction(record, columns, args.out)
     print_faults(record, (), console)
     console.result({**data, **data_of(record), **_wrote(args, run, console)})
