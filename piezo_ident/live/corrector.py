@@ -24,7 +24,7 @@ from piezo_ident.fitting.adaptation import Adaptation, Learns, Recalled
 from piezo_ident.fitting.attribution import Attribution, percent_change, SURE
 from piezo_ident.live.predictor import BRIDGE
 from piezo_ident.live.sample_clock import BlockClock, Kind
-from piezo_ident.model.observer import HORIZON, Observed, Observer
+from piezo_ident.model.observer import ACCEPT_AFTER, HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
@@ -98,11 +98,13 @@ class Corrector:
         [samples]
     gain, drift : bool, optional
         Whether the gain is followed, too, and whether as one that drifts.
-    rate : float, optional
-        Corrections published per second of the stream.
     adapt : {'off', 'gain', 'hysteresis'}, optional
         Part of the model that the corrector learns.  The observer then corrects the free run of
         the learnt model.
+    accept_after : float, optional
+        Time after which the observer believes a step of the sensor [s].
+    rate : float, optional
+        Corrections published per second of the stream.
 
     Attributes
     ----------
@@ -116,10 +118,11 @@ class Corrector:
         gain: bool = False,
         drift: bool = False,
         adapt: Learns = 'off',
+        accept_after: float = ACCEPT_AFTER,
         rate: float = RATE,
     ) -> None:
         self._horizon, self._gain, self._drift, self._adapt = horizon, gain, drift, adapt
-        self._rate = rate
+        self._rate, self._accept_after = rate, accept_after
         self._model: StageModel | None = None
         self._adaptation: Adaptation | None = None
         self._attribution: Attribution | None = None
@@ -153,10 +156,13 @@ class Corrector:
         gain: bool,
         drift: bool,
         adapt: Learns,
+        accept_after: float,
+        *,
         recalled: Recalled = StageModel.stream,
     ) -> None:
         """Change the settings, see `Corrector`, and begin anew."""
         self._horizon, self._gain, self._drift, self._adapt = horizon, gain, drift, adapt
+        self._accept_after = accept_after
         self._learn_anew(recalled)
 
     def _learn_anew(self, recalled: Recalled) -> None:
@@ -268,7 +274,12 @@ class Corrector:
                     self._adaptation.begin(self._at_rest)
             self._is_new = False
             self._observer = Observer(
-                model, horizon=self._horizon, known=known, gain=self._gain, drift=self._drift
+                model,
+                horizon=self._horizon,
+                known=known,
+                gain=self._gain,
+                drift=self._drift,
+                accept_after=self._accept_after,
             )
         elif kind is Kind.GAP and self._last is not None:
             # the predictor bridged this gap by a straight line, too

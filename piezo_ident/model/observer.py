@@ -90,8 +90,8 @@ MIRRORED = (-2.5, -1.5)
 BEYOND = 1.0 / np.sqrt(12.0)
 #: deviation beyond which a measurement is refused at first, in standard deviations (taste)
 GATE = 5.0
-#: time of refused measurements after which they are believed [s]
-PATIENCE = 5.0
+#: time of refused measurements after which they are believed [s] (taste)
+ACCEPT_AFTER = 5.0
 #: share of the range that counts as its lower end, where the memory is known
 REST = 0.01
 
@@ -158,6 +158,8 @@ class Observer:
         always does.
     gain, drift : bool, optional
         Whether the gain is followed, too, and whether as a drifting gain.
+    accept_after : float, optional
+        Time after which refused measurements are believed [s].
     """
 
     def __init__(
@@ -172,6 +174,7 @@ class Observer:
         known: bool = False,
         gain: bool = False,
         drift: bool = False,
+        accept_after: float = ACCEPT_AFTER,
     ) -> None:
         if horizon < 1:
             raise DataError(f'observer: the horizon is at least one sample, got {horizon}')
@@ -183,20 +186,22 @@ class Observer:
         self._zeros = np.array(ZEROS) if zeros is None else np.array(zeros) / span
         self._group = max(1, round(GROUP * model.sample_rate))
         self._gain, self._drift = gain or drift, drift
-        self._law, self._row = self._laws(size, noisy, gate)
+        self._law, self._row = self._laws(size, noisy, gate, accept_after)
         low, high = model.scaling.u(model.scaling.range).tolist()
         self._low, self._width = low, high - low
         self._input = model.input_chain()
         self._bounds = MemoryBounds(model.hysteresis, low, (low, high))
         self._is_known, self._started, self._is_lost = known, False, False
 
-    def _laws(self, error: float, noise: float, gate: float) -> tuple[kernel.Law, Array]:
+    def _laws(
+        self, error: float, noise: float, gate: float, accept_after: float
+    ) -> tuple[kernel.Law, Array]:
         model, rate, size = self.model, self.model.sample_rate, self._group
         gains, times = creep_elements(model)
         left = np.exp(-1.0 / (rate * times))
         before = left[:, None] ** -np.arange(size)
         gains = model.dynamics.gain * gains
-        groups = max(1.0, PATIENCE * rate / size)
+        groups = max(1.0, accept_after * rate / size)
         growth = 1.0 / groups if gate < np.inf else 0.0
         h = model.hysteresis
         reach = BEYOND * float(np.ptp(h(np.linspace(*h.span, 65))))

@@ -31,7 +31,7 @@ from std_msgs.msg import Float64MultiArray
 
 QUANTITIES = ('voltage', 'displacement', 'prediction', 'residual', 'estimate')
 #: settings of the observer
-OBSERVED = ('horizon', 'observe_gain', 'observe_drift', 'adapt')
+OBSERVED = ('horizon', 'observe_gain', 'observe_drift', 'adapt', 'accept_after')
 #: time for which a problem of the stream stays in the status [s], and most problems there
 REMEMBER, MOST = 5.0, 4
 #: longest wait of a block for the voltage of a further axis, and period of the time-outs [s]
@@ -109,10 +109,9 @@ class ModelNode(LabNode):
             for one in self._comparisons.values():
                 one.error.window = one.left.window = changed['window']
         if {*OBSERVED} & set(changed):
-            new = {**self.values, **changed}
-            horizon, gain, drift, adapt = (new[name] for name in OBSERVED)
+            settings = [{**self.values, **changed}[name] for name in OBSERVED]
             for k, one in enumerate(self._comparisons.values()):
-                one.corrector.set_up(horizon, gain, drift, adapt, self._recalled(k))
+                one.corrector.set_up(*settings, recalled=self._recalled(k))
                 one.left.clear()
 
     def _recalled(self, axis: int) -> Recalled:

@@ -16,7 +16,7 @@ from functools import partial
 
 from piezo_ident.identification.settings import SOLVERS
 from piezo_ident.live.predictor import LEVEL
-from piezo_ident.model.observer import HORIZON
+from piezo_ident.model.observer import ACCEPT_AFTER, HORIZON
 
 #: topics of blocks of samples, and topics of texts that a late node must still receive
 SAMPLE_TOPICS = (
@@ -188,9 +188,7 @@ MODEL = (
         1000.0,
     ),
     _WINDOW,
-    _at_start(
-        'preview_rate', 50.0, 'rate of the preview, and of the corrections', 'Hz', 1.0, 200.0
-    ),
+    _at_start('preview_rate', 50.0, 'rate of the preview and the corrections', 'Hz', 1.0, 200.0),
     Declaration(
         'horizon',
         HORIZON,
@@ -206,6 +204,9 @@ MODEL = (
         'off',
         'what the estimate learns: nothing, the gain, or the hysteresis and creep, too',
         choices=('off', 'gain', 'hysteresis'),
+    ),
+    Declaration(
+        'accept_after', ACCEPT_AFTER, 'age at which a step becomes the new zero', 's', 0.1, 3600.0
     ),
     Declaration('output', '', 'file into which ~/save writes the learnt model; empty: none'),
     _at_start('interval', LEVEL, 'share of the errors that the band holds', '1', 0.01, 0.999),

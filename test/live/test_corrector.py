@@ -255,7 +255,8 @@ def test_a_model_that_comes_later_learns_as_one_from_the_start():
         line = Line(model, adapt='hysteresis')
         for k in line.play(y):
             if late and k == 2000:
-                line.corrector.set_up(100, False, False, 'hysteresis', line.predictor.caught_up)
+                caught_up = line.predictor.caught_up
+                line.corrector.set_up(100, False, False, 'hysteresis', 5.0, recalled=caught_up)
                 line.got.clear()
         got.append((line.rows[1][-2000:], line.corrector.told['learnt/gain']))
     assert_allclose(*(x for x, _ in got), rtol=0, atol=2e-8)

@@ -274,17 +274,18 @@ def test_lost_readings_and_outliers_leave_it_going_and_less_sure():
     assert seen.std[50_000] > seen.std[30_100] and seen.std[-1] < seen.std[50_000]
 
 
-def test_a_zero_that_moves_is_followed_only_if_it_lasts():
+@pytest.mark.parametrize('after', [5.0, 3.0])
+def test_a_zero_that_moves_is_followed_only_if_it_lasts(after):
     model, n = creeping(), 20_000
     v = moved(n)
     truth = model.simulate(v)
     y = with_noise(truth, 1.5e-9)
     y[5000:5300] += 1e-6
     y[8000:] += 1e-6
-    seen = observe(model, Piece(v, y, SLOW_RATE), error=1e-4 * SPAN)
-    offset = seen.estimate - truth
-    assert np.abs(offset[5000:12_900]).max() < 1e-4 * SPAN
-    assert np.abs(offset[13_500:] - 1e-6).max() < 0.1e-6
+    seen = observe(model, Piece(v, y, SLOW_RATE), error=1e-4 * SPAN, accept_after=after)
+    offset, end = seen.estimate - truth, 8000 + int(after * SLOW_RATE)
+    assert np.abs(offset[5000 : end - 100]).max() < 1e-4 * SPAN
+    assert np.abs(offset[end + 500 :] - 1e-6).max() < 0.1e-6
 
 
 def test_in_midstream_it_soon_errs_no_more_than_with_its_memory_known():
