@@ -26,6 +26,7 @@ import tempfile
 import time
 
 import alone  # noqa: F401 - one thread of BLAS
+import any_record
 from bench_inverse import EFFECTS as INVERTED
 from bench_inverse import motion
 import numpy as np
@@ -116,11 +117,11 @@ def base_model(folder: Path) -> StageModel:
 # -- length, and returns a time [s] and the number of samples
 
 
-def clocked(work: Callable[[], object]) -> float:
+def clocked(work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
     """Return the time of a work."""
-    start = time.perf_counter()
+    start = clock()
     work()
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def nothing(size: float, folder: Path) -> tuple[float, int]:
@@ -193,11 +194,19 @@ def identify(size: float, folder: Path) -> tuple[float, int]:
     return clocked(lambda: pi.identify(records)), sum(record.n for record in records)
 
 
+def unlabelled(size: float, folder: Path) -> tuple[float, int]:
+    """Identify a record of noise without labels, of a stage whose law is not the model's."""
+    short, case = (any_record.draw('preisach', 'noise', 1, seconds=s) for s in (2.0, size))
+    any_record.program(short.fit)
+    took = clocked(lambda: any_record.program(case.fit), time.process_time)
+    return took, sum(v.size for v, _ in case.fit)
+
+
 def diagnose(size: float, folder: Path) -> tuple[float, int]:
     """Diagnose with the whole catalogue."""
     model, record = base_model(folder), to_diagnose(size)
     pi.diagnose(model, to_diagnose(17.0), pi.DiagnosisSettings(effects=(EFFECT,)))
-    return clocked(lambda: pi.diagnose(model, record)), record.n
+    return clocked(lambda: pi.diagnose(model, record), time.process_time), record.n
 
 
 def inverse(size: float, folder: Path) -> tuple[float, int]:
@@ -219,7 +228,12 @@ PLANS = {
     predict_bag: ('bag predicted to npz', BAGS, (10, 60)),
     inverse: ('inversion', (1, 4, 16, 64), (1, 4, 16)),
     identify: ('identification', (15.5, 31, 62, 124, HOUR), (15.5,)),
-    diagnose: (f'diagnosis, {len(catalogue())} candidates', (15, 30, 60, 120), (17,)),
+    unlabelled: ('identification, no labels, 10 kHz, processor time', (6, 30, 100), (6,)),
+    diagnose: (
+        f'diagnosis, {len(catalogue())} candidates, processor time',
+        (15, 30, 60, 120),
+        (17,),
+    ),
 }
 MEASURES = {measure.__name__: measure for measure in (nothing, *PLANS)}
 OF_BAGS = (write, read, convert, predict_bag)
