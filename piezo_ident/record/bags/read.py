@@ -18,6 +18,7 @@ import functools
 import itertools
 import math
 from pathlib import Path
+import re
 from typing import Any, TypeVar
 
 from piezo_ident.common.errors import ConfigError, DataError
@@ -32,7 +33,7 @@ from piezo_ident.record.bags.recover import (
     unpacked,
 )
 from piezo_ident.record.blocks import decode, quantity_of, Samples
-from piezo_ident.record.channels import applied_key, channel_of_quantity
+from piezo_ident.record.channels import applied_key, channel_of_quantity, role_of
 from piezo_ident.record.join import APPLIED, record_of_streams
 from piezo_ident.record.options import ReadOptions
 from piezo_ident.record.record import Fault, Record
@@ -44,6 +45,8 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 MESSAGE_TYPE = 'std_msgs/msg/Float64MultiArray'
+#: names of the topics of the model node, with the name of a further axis
+_COMPUTED = re.compile(r'(prediction|prediction_band|residual|estimate)(_\w+)?', re.ASCII)
 
 T = TypeVar('T')
 
@@ -265,8 +268,13 @@ def carried_quantities(bag: Bag) -> dict[str, str]:
 
 
 def is_computed(topic: str) -> bool:
-    """Return whether a model computes the samples of a topic."""
-    return topic.rpartition('/')[2] in ('prediction', 'residual', 'estimate')
+    """
+    Return whether a model computes the samples of a topic, of any axis.
+
+    >>> [is_computed(x) for x in ('/s/prediction', '/estimate_b', '/displacement_b')]
+    [True, True, False]
+    """
+    return bool(_COMPUTED.fullmatch(topic.rpartition('/')[2]))
 
 
 def _choose(
@@ -279,7 +287,8 @@ def _choose(
     if carried.get(applied) == 'voltage' and applied != chosen['voltage']:
         chosen[APPLIED] = applied
     for topic, quantity in sorted(carried.items(), key=lambda item: item[::-1]):
-        if channel_of_quantity(quantity) and topic.startswith(home):
+        channel = channel_of_quantity(quantity)
+        if channel and topic.startswith(home) and not (role_of(channel) and is_computed(topic)):
             if topic == f'{home}{applied_key(quantity)}':
                 chosen[applied_key(quantity)] = topic
                 continue

@@ -4,6 +4,7 @@
 """Bags as other tools read them, and bags as live recordings leave them."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 import re
 import shlex
 import sys
@@ -337,6 +338,18 @@ def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
     messages += [('/s/gauge', Samples(y.t, -y.values, '', y.quantity)) for _, y in blocks()]
     got = read_bag(write(tmp_path / 'both', messages))
     np.testing.assert_array_equal(got.pieces[0].y[:100], -blocks()[0][1].values)
+
+
+def test_what_a_model_says_of_a_further_axis_is_no_channel(tmp_path):
+    messages = []
+    for v, y in blocks():
+        v_b, y_b = replace(v, quantity='voltage_b'), replace(y, quantity='displacement_b')
+        messages += [('/s/voltage', v), ('/s/displacement', y), ('/s/voltage_b', v_b)]
+        messages += [(f'/s/{x}_b', y_b) for x in ('prediction', 'prediction_band', 'estimate')]
+        messages += [('/s/residual_b', y), ('/s/gauge_b', replace(y_b, values=-y.values))]
+    (piece,) = read_bag(write(tmp_path / 'bag', messages)).pieces
+    assert sorted(piece.channels) == ['v_b', 'y_b']
+    np.testing.assert_array_equal(piece.channels['y_b'], -piece.y)
 
 
 @pytest.mark.parametrize('voltage', ['voltage', 'drive'])
