@@ -109,15 +109,16 @@ def check_order(model: Path, record: Path, verb: str) -> None:
 
 def check_bag_options(paths: Sequence[Path], args: SimpleNamespace) -> None:
     """Refuse options for bags if all records are tables, and options for tables if all bags."""
-    tables = all(p.is_file() and not storage_of(p) for p in paths)
-    bags = all(p.is_dir() or storage_of(p) for p in paths)
-    kind, other = ('bags', 'a table') if tables else ('tables', 'a bag')
-    topics = 'namespace', 'voltage_topic', 'displacement_topic'
-    cells = 'columns', 'rate', 'time_unit', 'voltage_unit'
-    for name in topics if tables else cells if bags else ():
+    if all(p.is_file() and not storage_of(p) for p in paths):
+        kind, own, names = 'bags', 'a table', ['namespace', 'voltage_topic', 'displacement_topic']
+    elif all(p.is_dir() or storage_of(p) for p in paths):
+        kind, own, names = 'tables', 'a bag', ['columns', 'rate', 'time_unit', 'voltage_unit']
+    else:
+        return
+    for name in names:
         if getattr(args, name, None) is not None:
             option = f'--{name.replace("_", "-")}'
-            raise ConfigError(f'{option} is for {kind}, and {paths[0]} is {other}; leave it out')
+            raise ConfigError(f'{option} is for {kind}, and {paths[0]} is {own}; leave it out')
 
 
 def fields_of(args: SimpleNamespace, kind: type) -> dict[str, Any]:
