@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 import functools
 from pathlib import Path
 import time
@@ -211,7 +212,7 @@ class ModelNode(LabNode):
                 parts.append(Samples(prediction.t, y, prediction.segment, f'displacement{tail}'))
                 self._publish(f'prediction{tail}', parts[-1])
                 if (band := predictor.half_width) is not None:
-                    half = Samples(band.t, np.atleast_2d(band.values)[k], band.segment)
+                    half = replace(parts[-1], values=np.atleast_2d(band.values)[k])
                     self._quantities[f'prediction_band{tail}'].publish(to_message(half))
         if predictor.problem:
             self._note_problem(predictor.problem)

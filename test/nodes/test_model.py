@@ -128,6 +128,7 @@ def test_a_model_with_a_band_publishes_its_half_width_beside_the_prediction(fast
     np.testing.assert_array_equal(at, t)
     v = sine(2000)[1]
     np.testing.assert_array_equal(half, BandStream(model_of(text), 0.9).follow(v, y))
+    assert halves[-1].quantity == 'displacement'
 
 
 def test_prediction_is_the_model_bit_for_bit_and_a_new_one_takes_over_without_a_glitch(fast):
