@@ -165,11 +165,13 @@ class ExcitationClient:
 
     def _leave(self, answer: Any = None) -> None:
         """Stop the program of a start that was given up, unless the start was refused."""
-        if answer is None or answer is self.left:
-            self.left = None
-            if answer is None or answer.result().success:
-                self._stop.call_async(Trigger.Request())
-            self._give_back()
+        # the answer to a newer start tells which of the two programs plays
+        if self._phase == 'starting' or (answer is not None and answer is not self.left):
+            return
+        self.left = None
+        if answer is None or answer.result().success:
+            self._stop.call_async(Trigger.Request())
+        self._give_back()
 
     def _give_back(self, *_: object) -> None:
         """Restore the earlier program of the excitation, unless another run is being started."""
@@ -287,11 +289,16 @@ class ExcitationClient:
         # an excitation that refuses plays a program of someone else, which must not be stopped
         success = response is None or response.success
         self._phase = 'playing' if success else 'refused'
+        if self.left is not None and success:
+            # the program of an earlier start is over
+            self._start.remove_pending_request(self.left)
+            self.left = None
+        elif self.left is not None and self.left.done():
+            self._leave(self.left)
         self._give_back()
         if not success:
             self._end(f'the excitation does not start: {response.message}')
             return
-        self.left = None
         self._begin()
         self._sign = time.monotonic()
         # the status may have come before the answer

@@ -171,6 +171,35 @@ def test_a_cancelled_start_whose_answer_is_lost_is_stopped_once(monkeypatch):
     assert stopper.calls == 1
 
 
+@pytest.mark.parametrize('is_new_accepted', [True, False])
+@pytest.mark.parametrize('answer', ['before', 'after', 'never'])
+def test_a_late_answer_to_an_earlier_start_stops_no_newer_run(is_new_accepted, answer):
+    client, node = starting()
+    setter, _, starter, stopper = node.clients
+    client.stop()
+    (earlier,) = starter.waited_for
+    starter.dropped = 2
+    client.start('another program', 20.0, lambda reason: None)
+    for _ in range(4):
+        client.poll()
+    assert client.is_starting
+    (new,) = starter.waited_for - {earlier}
+    if answer == 'before':
+        earlier.set_result(Trigger.Response(success=True))
+        # the answer to the newer start is not known yet
+        assert stopper.calls == 0
+    new.set_result(Trigger.Response(success=is_new_accepted))
+    client.poll()
+    if answer == 'after':
+        earlier.set_result(Trigger.Response(success=True))
+    # a refused newer start means that the earlier program plays
+    assert stopper.calls == (not is_new_accepted and answer != 'never')
+    assert client.running == is_new_accepted
+    assert (client.left is None) == (is_new_accepted or answer != 'never')
+    if client.left is None:
+        assert programs(setter) == ['a program', 'another program', 'mine']
+
+
 def test_a_program_that_is_over_is_not_stopped():
     client, node = starting()
     _, _, starter, stopper = node.clients
