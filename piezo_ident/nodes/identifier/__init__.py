@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Identifier node: captures samples, drives the excitation, and identifies the model.
+Identifier node, the jobs of its worker process, and its client of the excitation.
 
-The worker process of the node imports this package without ROS.
+The worker process imports this package without ROS.
 """

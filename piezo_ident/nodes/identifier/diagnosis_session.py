@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnose a capture, request the motion that would decide, and diagnose again."""
+"""Diagnose the model by the capture, request the deciding motion, and diagnose again."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
 
 class DiagnosisSession:
     """
-    Diagnoses a model until no question is open or no request is left.
+    One ``~/diagnose``: diagnoses, and requests of motion from the excitation between them.
 
-    Each diagnosis begins with the same `model`; `diagnosis` is the last result.
+    A request follows while a question is open and requests are left.  Each diagnosis judges the
+    same `model` by all later data; `diagnosis` is the last result.
     """
 
     def __init__(self, host: IdentifierNode, capture: Capture) -> None:
         self._host, self._capture = host, capture
         self.model: StageModel | MultiAxisModel | None = None
         self.diagnosis: Diagnosis | EachAxis[Diagnosis] | None = None
-        # the mark up to which samples went into the model, and cannot test it
+        # mark of the end of the samples that the model was identified from
         self._used: Mapping[str, int] = {}
         # the identified model and its mark, also while a model file replaces them
         self._own: tuple[StageModel | MultiAxisModel | None, Mapping[str, int]] = (None, {})
@@ -41,42 +42,38 @@ class DiagnosisSession:
     def take(
         self, model: StageModel | MultiAxisModel, used: Mapping[str, int], *, is_file: bool = False
     ) -> None:
-        """
-        Take another model to diagnose.
-
-        `used` is the `Capture.mark` up to which the capture served to identify the model.
-        """
+        """Take another model, identified from the samples up to the `Capture.mark` `used`."""
         self.model, self.diagnosis, self._used = model, None, used
         if not is_file:
             self._own = model, used
 
     def leave_file(self) -> None:
-        """Take the identified model in place of the model of a file; without one, none."""
+        """Take the identified model, or None, in place of the model of a file."""
         model, used = self._own
         if self.model is not model:
             self.model, self.diagnosis, self._used = model, None, used
 
     def forget(self) -> None:
-        """Note that the capture was cleared."""
+        """Forget the marks of a capture that was cleared."""
         self._used, self._own = {}, (self._own[0], {})
 
     def drop(self) -> None:
-        """Give up the session under way."""
+        """End the present session without a result."""
         self._requested: list[Kind] = []
         self._last: DiagnosisOutcome | None = None
         self._notes: list[str] = []
 
     @property
     def seconds(self) -> float:
-        """Length of the capture that the identification did not use [s]."""
+        """Length of the capture after the samples of the identification [s]."""
         keys = ('voltage', 'displacement')
         return min(self._capture.seconds_since(self._used, key) for key in keys)
 
     def begin(self) -> str:
         """
-        Begin; return a message about the first step.
+        Begin a session; return a message about its first step.
 
-        PiezoIdentError without a model, or without both data and an excitation.
+        PiezoIdentError if the model is missing, or if later data and excitation are.
         """
         self.drop()
         if self.model is None:
@@ -129,7 +126,7 @@ class DiagnosisSession:
             self._conclude(self._last)
 
     def take_outcome(self, outcome: DiagnosisOutcome) -> None:
-        """Request the experiment that would decide an open question, or conclude."""
+        """Take the result of a diagnosis; request a further experiment, or conclude."""
         if outcome.diagnosis is not None:
             self._last = outcome
         wanted, hindrance = outcome.wanted, self._hindrance()

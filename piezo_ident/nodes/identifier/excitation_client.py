@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Have the excitation play a program for the identifier, and follow the program to its end.
+Call the excitation: have it play a program, and follow the program to its end.
 
-The client restores the earlier program of the excitation once it has answered to the start.
-Otherwise the next ``~/start`` of a person would play the program of the identifier.
+The phases of a run are *finding* (services of the excitation, topics of the stage), *asking* (for
+the present program), *setting* (the program of the run), *starting* and *playing*.  After the
+answer to ``~/start`` the client sets the earlier program again, for the next start by a person.
 """
 
 from __future__ import annotations
@@ -26,16 +27,15 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-#: callback with None when a program was captured to its end, else with the reason
+#: callback with None for a program that was captured to its end, or with the cause of another end
 Ended = Callable[[str | None], None]
-#: states of the excitation before the beginning and after the end of a program
+#: states of the excitation that plays no program
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
-#: state before the first status of this run; an older status is about an older run
+#: state until the first status after ``~/start`` was called
 _UNHEARD = 'unheard'
-#: longest travel of the last blocks after the excitation says done [s]
+#: longest wait for the last blocks after the status done [s]
 _TAIL = 1.0
-#: longest time for which a stage that warns may leave the voltage unanswered [s]: such a stage may
-#: refuse the rate
+#: longest wait for displacement while the stage warns, as when it refuses the rate [s]
 _UNANSWERED = 3.0
 #: time after which an unanswered request is sent again [s]
 _AGAIN = 2.0
@@ -52,26 +52,18 @@ class Streams:
 
 class ExcitationClient:
     """
-    Plays one program of the excitation at a time.
+    Follows one run of the excitation at a time.
 
-    All calls return at once; `poll` looks for responses.
-
-    Parameters
-    ----------
-    node : Node
-        Gets the clients and the subscription.
-    streams : callable
-        Returns the present `Streams`.
-    missing : callable
-        Returns the topics without a publisher, as text; '' if all have one.
+    All calls return at once; `poll` takes the run from phase to phase.  `streams` returns the
+    present `Streams`, and `missing` the topics without a publisher, as text.
     """
 
     def __init__(
         self, node: Node, streams: Callable[[], Streams], missing: Callable[[], str]
     ) -> None:
         self._streams, self._missing = streams, missing
-        self._begin: Callable[[], None] = _nothing
-        self._ended: Ended = _nothing
+        self._begin: Callable[[], None] = lambda: None
+        self._ended: Ended = lambda _: None
         self._set, self._get, self._start, self._stop = (
             node.create_client(kind, f'excitation/{name}', qos_profile=SERVICE)
             for kind, name in (
@@ -85,12 +77,12 @@ class ExcitationClient:
         node.create_subscription(DiagnosticStatus, 'stage/status', self._hear_stage, LATCHED)
         self._phase = self._trouble = ''
         self._future: Any = None
-        # the client and the request of the future, and when it was sent
+        # client and request of the future, and the time of the request
         self._asks: tuple[Any, Any] = (None, None)
         self._asked = 0.0
         # the earlier program of the excitation, until it is restored
         self._before: Any = None
-        #: start that was given up before its answer, which tells whether the program is this one's
+        #: future of a start that was given up before its answer; an accepted start is stopped
         self.left: Any = None
         self._looks = Looks()
         self._state, self._message, self._sent = '', '', 0
@@ -130,30 +122,21 @@ class ExcitationClient:
         self, program: str, limit: float, ended: Ended, begin: Callable[[], None] | None = None
     ) -> None:
         """
-        Begin a run.
+        Begin a run of a `program`; a silence of excitation or stage for `limit` [s] ends the run.
 
-        Parameters
-        ----------
-        program : str
-            For the excitation's parameter ``program``.
-        limit : float
-            Longest silence of the excitation or the stage [s].
-        ended : callable
-            Called once: with None when the program was captured to its end, else with the reason.
-            Not called after `stop`.
-        begin : callable, optional
-            Called when the excitation has accepted the start.
+        The client calls `begin` when the excitation has accepted the start, and `ended` at the
+        end of the run, but not after `stop`.
         """
         self._program, self._limit = program, limit
-        self._begin, self._ended = begin or _nothing, ended
+        self._begin, self._ended = begin or (lambda: None), ended
         self._phase, self._future, self.progress = 'finding', None, 0.0
         self._sign = time.monotonic()
 
     def stop(self) -> str:
-        """Give up the run; stop its program, but none of someone else; return what happens."""
+        """Give up the run, and stop its program alone; return a message for people."""
         phase, self._phase = self._phase, ''
         if phase == 'starting' and self._future is not None:
-            # an excitation that plays for someone else will refuse the start
+            # the answer tells whether the excitation plays this program
             self.left = self._future
             self.left.add_done_callback(self._leave)
             return 'the excitation ramps to rest if it has accepted the start'
@@ -205,17 +188,17 @@ class ExcitationClient:
         self._trouble = '' if message.level == DiagnosticStatus.OK else text
 
     def poll(self) -> None:
-        """Continue the run, or give it up after too long a silence."""
+        """Take the run to its next phase, or give it up after too long a silence."""
         self._looks.look()
         if self._phase:
             getattr(self, f'_{self._phase}')()
         elif self.left is not None and self._plays and self._looks.is_over(self._sign, _AGAIN):
-            # the answer is lost
+            # the answer is lost, and the start was accepted
             self._leave()
 
     @property
     def _plays(self) -> bool:
-        """Whether the excitation has told since the start that it plays a program."""
+        """Whether a status since the start says that the excitation plays a program."""
         return self._state not in (*_RESTING, _UNHEARD)
 
     @property
@@ -244,7 +227,7 @@ class ExcitationClient:
         self._asks = client, request
 
     def _insisted(self, doing: str) -> Any:
-        """Return the response to the last request; send the request again after a while."""
+        """Return the response to the last request; send the request again after `_AGAIN`."""
         response = self._response(doing)
         # a request before both sides have matched is lost; a second request is harmless
         if response is None and self.running and time.monotonic() - self._asked > _AGAIN:
@@ -254,7 +237,7 @@ class ExcitationClient:
         return response
 
     def _asking(self) -> None:
-        # an excitation without this service keeps the program of the run
+        # without this service the excitation keeps the program of the run
         if self._get.service_is_ready() or time.monotonic() - self._sign < _AGAIN:
             response = self._insisted('telling its program')
             if response is None:
@@ -282,11 +265,11 @@ class ExcitationClient:
     def _starting(self) -> None:
         response = self._response('starting')
         if response is None:
-            # The answer can be lost.  The excitation took the program, so it plays no other.
+            # a lost answer: the excitation has taken the program, and plays
             if not (self.running and self._plays and self._looks.is_over(self._sign, _AGAIN)):
                 return
             self._start.remove_pending_request(self._future)
-        # an excitation that refuses plays a program of someone else, which must not be stopped
+        # after a refusal the excitation plays a program of someone else: `_end` does not stop it
         success = response is None or response.success
         self._phase = 'playing' if success else 'refused'
         if self.left is not None and success:
@@ -356,7 +339,3 @@ def _program(value: Any) -> SetParameters.Request:
 def _moved(time: float, before: float) -> bool:
     """Return whether a stream has advanced; both times are NaN before its first sample."""
     return time != before and not (math.isnan(time) and math.isnan(before))
-
-
-def _nothing(*_: object) -> None:
-    """Do nothing."""

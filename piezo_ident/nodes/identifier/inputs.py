@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Receive the blocks of voltage, displacement and channels that the identifier captures."""
+"""Take the blocks of the subscriptions of the identifier, and add them to the capture."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from piezo_ident.record.channels import APPLIED, applied_key, channel_of_quantit
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-#: quantities of the blocks of a topic, beside the name of the topic
+#: quantities that the blocks of a topic may name, beside the name of the topic
 _CARRIED = {'voltage': (), 'displacement': (), APPLIED: ('voltage',)}
 
 
 class Inputs:
     """
-    Subscriptions that fill a capture.
+    Subscriptions without the executor; `drain` moves their blocks into the capture.
 
     `channels` are topics of further axes and channels; `passed` counts the samples of each topic.
     """
@@ -44,7 +44,7 @@ class Inputs:
         self._topics = {t: (key, unspun(node, Float64MultiArray, t)) for t, key in keys.items()}
 
     def drain(self, *, hold: bool) -> None:
-        """Capture the received blocks, or keep them for later."""
+        """Add the received blocks to the capture; with `hold` keep them for the next call."""
         for topic, (key, subscription) in self._topics.items():
             self._held += ((topic, key, *block) for block in received(subscription, raw=False))
         while self._held and not hold:
@@ -74,14 +74,14 @@ class Inputs:
         c = self._capture
         answered = c.last_time('displacement')
         for key in c.keys:
-            # the stage sends these topics one after the other; a run ends with the last of them
+            # the stage sends these topics one after the other; the last one ends the answer
             if key.startswith((APPLIED, 'displacement_')):
                 answered = min(answered, c.last_time(key))
         return Streams(self.passed['voltage'], c.last_time('voltage'), answered)
 
     @property
     def unpublished(self) -> str:
-        """Topics without a matched publisher, whose messages would be lost."""
+        """Topics of the stage without a matched publisher; the applied voltage may be absent."""
         unmatched = (x for x in self._topics.items() if not x[1][1].get_publisher_count())
         topics = [key or topic for topic, (key, _) in unmatched]
         driven = ('voltage', APPLIED)

@@ -4,8 +4,7 @@
 """
 Jobs of the worker process of the identifier, independent of ROS.
 
-The node sends a function of this module to the worker process, which adds the last argument,
-`tick`.
+The node sends a function of this module and its arguments; the process adds the argument `tick`.
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class IdentificationOutcome(Outcome):
-    """Result of an identification, or of a step, with the results of `steps` so far."""
+    """Result of an identification, or of one step; `steps` are the results of steps so far."""
 
     steps: Steps | None = None
     identification: Identification | EachAxis[Identification] | None = None
@@ -108,7 +107,7 @@ class IdentificationOutcome(Outcome):
 @dataclass(frozen=True, eq=False)
 class DiagnosisOutcome(Outcome):
     """
-    Result of a diagnosis; the `diagnosis` is None if the capture lacks motion.
+    Result of a diagnosis; a capture that lacks motion leaves the `diagnosis` None.
 
     `judged` is the diagnosed model as YAML, `wanted` an experiment that would decide a question.
     """
@@ -209,7 +208,7 @@ def _joined(result: T | EachAxis[T], text: Callable[[T], str]) -> str:
 
 
 def _figures(result: T | EachAxis[T], of: Callable[[T], dict[str, str]]) -> dict[str, str]:
-    """Collect the figures of each axis; those of a further axis end in its name."""
+    """Collect the figures of each axis; the name of a further axis ends its figures."""
     return {f'{k}{tail}': x for tail, one in _each(result).items() for k, x in of(one).items()}
 
 

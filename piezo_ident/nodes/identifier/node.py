@@ -1,7 +1,14 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Identifier node: subscriptions, services, status, and the jobs of its worker process."""
+"""
+Identifier node: captures the streams of a stage, and identifies and diagnoses its model.
+
+A timer takes the blocks of `voltage`, `displacement`, `applied_voltage`, further axes and channels
+from their subscriptions every `DRAIN`, and adds them to the capture.  A service starts a job on
+the capture in the worker process.  ``~/run`` and ``~/diagnose`` also have the excitation play a
+program.  The executor publishes the result of a job on `model`, `report` and ``~/status``.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +53,7 @@ PATIENCE = 0.6
 
 
 class IdentifierNode(LabNode):
-    """Captures, identifies, and publishes model and report."""
+    """Captures, identifies, diagnoses, and publishes model and report."""
 
     executable = 'identifier'
 
@@ -60,7 +67,7 @@ class IdentifierNode(LabNode):
         self._identified: Identification | EachAxis[Identification] | None = None
         self._axes = [name for name in self.values['axes'] if name]
         self._session = DiagnosisSession(self, self._capture)
-        # mark of the capture that the running job uses, and the last published model
+        # mark of the capture of the running identification, and the last published model
         self._using, self._published = dict[str, int](), ''
         if path := self.values['model']:
             self._session.take(load(path), {}, is_file=True)
@@ -82,63 +89,7 @@ class IdentifierNode(LabNode):
         for name in ('run', 'diagnose', 'cancel', 'clear', 'save'):
             self.offer(name, getattr(self, f'_{name}'))
 
-    def offer(self, name: str, handler: Callable[[], str]) -> None:
-        """Offer a service; samples sent before the call count as captured."""
-
-        def drained() -> str:
-            self._drain()
-            return handler()
-
-        super().offer(name, drained)
-
-    def _drain(self) -> None:
-        # blocks wait until the excitation has accepted the start, which clears the earlier capture
-        self._inputs.drain(hold=self._excitation.is_starting)
-
-    def _set_state(
-        self, state: str, progress: float, text: str, level: bytes = OK, **more: Any
-    ) -> None:
-        self._state = state
-        self.report_status(state, progress, text, level, **more)
-
-    def _poll(self) -> None:
-        if self._excitation.running:
-            # a run may end once all its blocks are captured
-            self._drain()
-        self._excitation.poll()
-        if waits_for := self._excitation.waits_for:
-            # the capture is still the earlier one
-            self._set_state('exciting', 0.0, f'{self._task}: {waits_for}')
-        elif self._excitation.running:
-            segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
-            about = f'{self._capture.seconds:.0f} s captured{segment}'
-            text, brief = f'{self._task}: {about}', f'{about}: {self._task}'
-            self._report_capture('exciting', self._excitation.progress, text, brief)
-        elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
-            self._reported_at = time.monotonic()
-            kept = f'{self._kept()} captured' if self._capture.keys else 'ready'
-            self._report_capture('idle', 0.0, kept)
-
-    def _report_capture(self, state: str, progress: float, text: str, brief: str = '') -> None:
-        problems = self._capture.problems
-        text, brief = ('; '.join([t, *problems]) if t else '' for t in (text, brief))
-        more = {'brief': brief, 'problems': '; '.join(problems)}
-        self._set_state(state, progress, text, WARN if problems else OK, **more)
-
-    def _kept(self) -> str:
-        keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
-        return ', '.join(f'{self._capture.seconds_since({}, key):.3f} s of {key}' for key in keys)
-
-    def _is_busy(self) -> bool:
-        # parameters are declared before the other attributes exist
-        if not hasattr(self, '_excitation'):
-            return False
-        # a job has ended when its outcome is taken
-        return self._excitation.running or self._worker.is_busy or bool(self._outcomes)
-
-    def _refuse_when_busy(self) -> None:
-        if self._is_busy():
-            raise PiezoIdentError(f'busy: {self._task}; wait for its end, or call ~/cancel')
+    # parameters
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse values that the settings would refuse later."""
@@ -171,10 +122,55 @@ class IdentifierNode(LabNode):
         elif path is not None:
             self._session.leave_file()
 
+    # topics
+
+    def _drain(self) -> None:
+        # blocks wait for the answer to the start: an accepted start clears the earlier capture
+        self._inputs.drain(hold=self._excitation.is_starting)
+
+    def _poll(self) -> None:
+        if self._excitation.running:
+            # a run may end once all its blocks are captured
+            self._drain()
+        self._excitation.poll()
+        if waits_for := self._excitation.waits_for:
+            # the capture is still the earlier one
+            self._set_state('exciting', 0.0, f'{self._task}: {waits_for}')
+        elif self._excitation.running:
+            segment = f', in segment {self._capture.segment}' if self._capture.segment else ''
+            about = f'{self._capture.seconds:.0f} s captured{segment}'
+            text, brief = f'{self._task}: {about}', f'{about}: {self._task}'
+            self._report_capture('exciting', self._excitation.progress, text, brief)
+        elif self._state == 'idle' and time.monotonic() - self._reported_at > TELL:
+            self._reported_at = time.monotonic()
+            kept = f'{self._kept()} captured' if self._capture.keys else 'ready'
+            self._report_capture('idle', 0.0, kept)
+
+    def _report_capture(self, state: str, progress: float, text: str, brief: str = '') -> None:
+        problems = self._capture.problems
+        text, brief = ('; '.join([t, *problems]) if t else '' for t in (text, brief))
+        more = {'brief': brief, 'problems': '; '.join(problems)}
+        self._set_state(state, progress, text, WARN if problems else OK, **more)
+
+    def _kept(self) -> str:
+        keys = dict.fromkeys(('voltage', 'displacement', *self._capture.keys))
+        return ', '.join(f'{self._capture.seconds_since({}, key):.3f} s of {key}' for key in keys)
+
+    # services
+
+    def offer(self, name: str, handler: Callable[[], str]) -> None:
+        """Offer a service whose handler finds all blocks that came before the call."""
+
+        def drained() -> str:
+            self._drain()
+            return handler()
+
+        super().offer(name, drained)
+
     def _run(self) -> str:
         self._refuse_when_busy()
         jobs.settings_of(self.values)
-        # older data may come from another stage, or another day
+        # the accepted start clears the capture: older data may come from another stage
         about = 'program for the identification'
         self.excite(self.values['program'], about, self._run_ended, self._forget)
         return 'the program is requested; see ~/status'
@@ -205,8 +201,9 @@ class IdentifierNode(LabNode):
         self._start(job)
         return f'{self._task} has begun; see ~/status'
 
-    def _start(self, job: Callable[[Tick], Result]) -> None:
-        self._worker.start(job, progress=self._progress, ended=self._ended)
+    def _diagnose(self) -> str:
+        self._refuse_when_busy()
+        return f'{self._session.begin()}; see ~/status'
 
     def _save(self) -> str:
         self._refuse_when_busy()
@@ -244,9 +241,18 @@ class IdentifierNode(LabNode):
         self._session.forget()
         self._steps = Steps()
 
-    def _diagnose(self) -> str:
-        self._refuse_when_busy()
-        return f'{self._session.begin()}; see ~/status'
+    def _refuse_when_busy(self) -> None:
+        if self._is_busy():
+            raise PiezoIdentError(f'busy: {self._task}; wait for its end, or call ~/cancel')
+
+    def _is_busy(self) -> bool:
+        # false while `__init__` declares the parameters
+        if not hasattr(self, '_excitation'):
+            return False
+        # a job has ended when its outcome is taken
+        return self._excitation.running or self._worker.is_busy or bool(self._outcomes)
+
+    # interface of the diagnosis session
 
     def can_excite(self) -> bool:
         """Return whether an excitation and a stage are present."""
@@ -261,7 +267,7 @@ class IdentifierNode(LabNode):
         self._set_state('exciting', 0.0, why)
 
     def start_diagnosis(self, job: Callable[[Tick], DiagnosisOutcome], seconds: float) -> None:
-        """Start a job; `DiagnosisSession.take_outcome` gets its result."""
+        """Start the job of a diagnosis; `DiagnosisSession.take_outcome` gets its result."""
         self._task = 'diagnosis'
         self._set_state('diagnosing', 0.0, f'the model is tested on {seconds:.3g} s')
         self._start(job)
@@ -281,9 +287,10 @@ class IdentifierNode(LabNode):
         """Report why the work failed."""
         self._set_state('failed', 0.0, reason, ERROR)
 
-    def _publish_model(self, text: str) -> None:
-        self._published = text
-        self._model.publish(String(data=text))
+    # jobs of the worker process
+
+    def _start(self, job: Callable[[Tick], Result]) -> None:
+        self._worker.start(job, progress=self._progress, ended=self._ended)
 
     def _progress(self, step: str, share: float) -> None:
         state = {'saving': 'saving', 'diagnosis': 'diagnosing'}.get(self._task, 'identifying')
@@ -292,7 +299,7 @@ class IdentifierNode(LabNode):
         self.report_status(state, percent, step, brief=f'{percent:.0f} %: {step}')
 
     def _ended(self, result: Result | None, error: Exception | None) -> None:
-        # the executor publishes the result, so that the worker is free when the end is reported
+        # runs in the thread of the worker; the executor publishes the result
         self._outcomes.append(functools.partial(self._conclude, result, error))
         self._wake.trigger()
 
@@ -328,6 +335,18 @@ class IdentifierNode(LabNode):
             self._session.take_outcome(result)
         else:
             self._set_state('done', 100.0, f'written: {result}')
+
+    def _publish_model(self, text: str) -> None:
+        self._published = text
+        self._model.publish(String(data=text))
+
+    # reports
+
+    def _set_state(
+        self, state: str, progress: float, text: str, level: bytes = OK, **more: Any
+    ) -> None:
+        self._state = state
+        self.report_status(state, progress, text, level, **more)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return the state of the capture."""

@@ -13,7 +13,7 @@ from typing import Any
 from piezo_ident.common.errors import Cancelled, PiezoIdentError
 from piezo_ident.common.process import Job, Tick, WorkerProcess
 
-#: callback with the result of a job and None, or with None and its error
+#: callback at the end of a job: (result, None) or (None, error)
 Ended = Callable[[Any, Exception | None], None]
 #: time between two reports of progress [s]
 EVERY = 0.1
@@ -21,10 +21,9 @@ EVERY = 0.1
 
 class Worker:
     """
-    Runs one job at a time without delaying the caller.
+    Runs one job at a time in a process of the niceness `nice`, without delaying the caller.
 
-    A larger niceness `nice` leaves more time to other processes.  The process first calls
-    `warm_up`, a function of a module.
+    The process first calls `warm_up`, a function of a module.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
@@ -41,8 +40,8 @@ class Worker:
         """
         Start a job; see `piezo_ident.common.process.WorkerProcess.run`.
 
-        Another thread calls `progress` with the step and its share done, at most every `EVERY`.
-        It calls `ended` with the result and None, or in case of an error with None and the error.
+        A thread of the job calls `progress` with the step and its share done, at most every
+        `EVERY`, and `ended` at the end.
         """
         if self.is_busy:
             raise PiezoIdentError('another job runs; wait for its end or cancel it')
@@ -75,7 +74,7 @@ class Worker:
             ended(result, None)
 
     def cancel(self) -> None:
-        """Cancel the job; it ends at its next tick, or with its process."""
+        """Cancel the job, which ends at its next tick; return at once."""
         self._cancel.set()
 
     def join(self, timeout: float) -> bool:
