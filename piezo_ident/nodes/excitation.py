@@ -4,16 +4,17 @@
 """
 Excitation node: plays programs on `voltage`, or on `reference` for the feedforward node.
 
-The node sends only after ``~/start``.  The clock of the samples starts at zero with every program.
-A block is sent when its first sample is due on this clock.  `rate_factor` makes the schedule
-faster or slower.  The node waits for no listener; each listener reports its losses.
+``~/start`` builds the program of the parameter `program`, waits for `subscribers`, and sends block
+after block from a thread.  The clock of the samples starts at zero with every program.  A block is
+sent when its first sample is due on this clock, which runs `rate_factor` times as fast as real
+time.  A late listener does not hold up the node; each listener reports its losses.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
 and SIGTERM end in a ramp of at most a second, if necessary steeper than `ramp_slew`.  Ramps run in
 real time.
 
 With `axes` the node drives several axes, each on its own topic with its own random signals:
-`voltage_b` for axis `b`.  They move at once, or with `in_turn` one after the other.  All axes
+`voltage_b` for axis `b`.  The axes move at once, or with `in_turn` one after the other.  All axes
 begin, end and stop together.
 
 Two programs at once would tear the stage to and fro.  The node therefore refuses to start beside a
@@ -96,7 +97,7 @@ class _Stopped(Exception):
 
 
 class ExcitationNode(LabNode):
-    """Plays the program of its parameter `program`."""
+    """Plays programs, each on a topic for every axis."""
 
     executable = 'excitation'
 
@@ -109,7 +110,7 @@ class ExcitationNode(LabNode):
         super().__init__(**kwargs)
         self._tails = self.tails()
         self._build(self.values['program'])
-        # loads the kernel, so that a ramp to rest need not wait for it
+        # compiles the kernel, so that a ramp to rest need not wait for it
         Guard(self._guard_settings())
         self._quantity = self.values['quantity']
         self._unit, self._scale = UNITS[self._quantity]
@@ -120,6 +121,8 @@ class ExcitationNode(LabNode):
         self._output = self._outputs[0]
         self.offer('start', self._start)
         self.offer('stop', self._stop)
+
+    # parameters
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse programs that cannot be played, and limits that are crossed."""
@@ -158,11 +161,7 @@ class ExcitationNode(LabNode):
         # a program keeps to its own slew
         return guard_settings({**v, 'slew': math.inf}, v['sample_rate'])
 
-    def _is_playing(self) -> bool:
-        thread, playing = self._thread, self._playing
-        # the thread lives on for a moment after its last status
-        is_over = playing is not None and playing.is_over
-        return thread is not None and thread.is_alive() and not is_over
+    # services
 
     def _start(self) -> str:
         if self._is_playing():
@@ -175,6 +174,8 @@ class ExcitationNode(LabNode):
             self.values['rate_factor'],
         )
         sequence = playing.sequence
+        # read before the start: the file of the program may be gone
+        notes = f'{self._unused(sequence)}{self._other_rate(sequence)}'
         for output in self._outputs:
             output.open()
         self._playing = playing
@@ -186,7 +187,7 @@ class ExcitationNode(LabNode):
         self._thread.start()
         return (
             f'{_name(sequence)}: {sequence.duration:.1f} s, {len(sequence.segments)} segments, '
-            f'{sequence.n} samples{self._unused(sequence)}{self._other_rate(sequence)}'
+            f'{sequence.n} samples{notes}'
         )
 
     def _other_rate(self, sequence: Sequence) -> str:
@@ -211,6 +212,12 @@ class ExcitationNode(LabNode):
         playing.stop.set()
         return f'ramping to {self.values["rest"]:g} {self._unit}'
 
+    def _is_playing(self) -> bool:
+        thread, playing = self._thread, self._playing
+        # the thread lives on for a moment after its last status
+        is_over = playing is not None and playing.is_over
+        return thread is not None and thread.is_alive() and not is_over
+
     # playing, in a thread of its own
 
     def _run(self, playing: Playing) -> None:
@@ -231,22 +238,11 @@ class ExcitationNode(LabNode):
             text = '; '.join(filter(None, [about, playing.second]))
             self._end(playing, 'done', 100.0, text, level)
 
-    def _end(
-        self, playing: Playing, state: str, progress: float, message: str, level: bytes = OK
-    ) -> None:
-        """Report the result; the next start may follow at once."""
-        playing.is_over = True
-        self.report_status(state, progress, message, level, samples=playing.tick)
-
     def _await_graph(self, playing: Playing) -> None:
         needed, limit = self.values['subscribers'], self.values['wait_limit']
         for output in self._outputs:
             while not output.poll(needed, limit):
                 self._sleep(playing, time.monotonic() + 0.02)
-
-    def _sleep(self, playing: Playing, until: float) -> None:
-        if playing.stop.wait(max(0.0, until - time.monotonic())):
-            raise _Stopped
 
     def _play(self, playing: Playing) -> None:
         sequence = playing.sequence
@@ -270,6 +266,10 @@ class ExcitationNode(LabNode):
             self.report_status('running', percent, text, level, **more)
         # a stop during the last block
         self._sleep(playing, time.monotonic())
+
+    def _sleep(self, playing: Playing, until: float) -> None:
+        if playing.stop.wait(max(0.0, until - time.monotonic())):
+            raise _Stopped
 
     def _send(self, playing: Playing, voltages: Many[NDArray[np.float64]], label: str) -> None:
         begin, n = time.perf_counter(), voltages[0].size
@@ -310,6 +310,15 @@ class ExcitationNode(LabNode):
             start = playing.tick
             self._send(playing, voltages, 'ramp:stop')
             clock.note(start - origin, size, time.monotonic())
+
+    def _end(
+        self, playing: Playing, state: str, progress: float, message: str, level: bytes = OK
+    ) -> None:
+        """Report the result; the next start may follow at once."""
+        playing.is_over = True
+        self.report_status(state, progress, message, level, samples=playing.tick)
+
+    # reports
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return rate, blocks, delays and head-room; watch for a second publisher."""

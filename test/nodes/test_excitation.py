@@ -10,6 +10,7 @@ import time
 from course import column, FS, HIGH, SHORT
 from graph import Graph, in_time
 import numpy as np
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.excitation import ExcitationNode
@@ -38,6 +39,18 @@ def lab():
         for topic in ('voltage', 'displacement', 'applied_voltage'):
             g.matched(topic)
         yield g
+
+
+def test_a_program_whose_file_cannot_be_read_again_is_not_played(monkeypatch):
+    # without a graph: the start fails before it needs one
+    node = ExcitationNode.__new__(ExcitationNode)
+    node._thread = node._playing = None
+    node.values = {'program': 'gone', 'block_size': 100, 'rate_factor': 1.0}
+    monkeypatch.setattr(ExcitationNode, '_build', lambda *_: (parse_program(SHORT).build(FS),))
+    monkeypatch.setattr(ExcitationNode, '_unused', lambda *_: '')
+    with pytest.raises(ConfigError, match='gone'):
+        node._start()
+    assert node._thread is None and node._playing is None
 
 
 def test_a_program_in_real_time(lab):
