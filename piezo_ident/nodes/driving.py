@@ -1,7 +1,11 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Base of a node that drives a stage: right to drive, ramps to rest, faults, safe end."""
+"""
+Base of the feedforward node: right to drive, ramps to rest, faults, safe end.
+
+A node with the right to drive is the only node that sends `voltage`; see `ExclusivePublisher`.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +38,10 @@ DRIVING = tuple(NOW)
 
 class DrivingNode(LabNode):
     """
-    Node with the right to drive, from a start until the stage rests after a stop.
+    Node that takes the right to drive, and gives it back when the stage rests after a stop.
 
-    A subclass sets a tracker before it drives, works in `work`, and publishes its state in
-    `report_state`.
+    A timer calls `work` every `PERIOD` until a stop, and then ramps to rest.  A subclass sets the
+    tracker before it drives, and publishes its state in `report_state`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -59,10 +63,10 @@ class DrivingNode(LabNode):
         self.offer('stop', self._stop)
 
     def report_state(self) -> None:
-        """Publish the status."""
+        """Publish state, problems and numbers on ``~/status``."""
 
     def work(self) -> str:
-        """Work for one `PERIOD`; return the next state when the right to drive has come."""
+        """Work for one `PERIOD`; the first call, with the right to drive, returns the state."""
         return ''
 
     def _take_right(self, tracker: Tracker) -> None:
@@ -117,7 +121,7 @@ class DrivingNode(LabNode):
                 self._faults.note('second', f'second publisher {second} on voltage{tail}', 0)
 
     def _halt(self, state: str, text: str) -> None:
-        """Ramp to rest, and report the state and the text at rest."""
+        """Begin a ramp to rest; at rest the node reports this state and text."""
         self._end = state, text
         self._begin_ramp()
         self._state = 'stopping'

@@ -5,8 +5,7 @@
 End a process on SIGINT or SIGTERM, from the first line of its code on.
 
 A Python signal handler waits for the main thread, which may be busy in a compiler.  The thread of
-this module hears a signal at once.  It then ends the process after the time that the process may
-take to close.
+this module hears a signal at once, leaves the process the time `patience` to close, and ends it.
 """
 
 from __future__ import annotations

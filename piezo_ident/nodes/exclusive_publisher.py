@@ -40,19 +40,9 @@ class ExclusivePublisher:
     """
     A publisher of blocks that asks for the right to drive before it sends.
 
-    Parameters
-    ----------
-    node : Node
-    topic : str
-    stays : bool, optional
-        Whether the publisher also exists between two drives.  It then refuses to drive beside any
-        publisher of another node name.  Without `stays` it drives beside a silent publisher, such
-        as an excitation between two programs; that excitation does not start beside this one.
-
-    Attributes
-    ----------
-    topic : str
-        Full name of the topic.
+    With `stays` the publisher exists between two drives, too, and any publisher of another node
+    name prevents a drive.  Without `stays` only a publisher that sends prevents a drive, so an
+    excitation between two programs does not.  `topic` is the full name of the topic.
     """
 
     def __init__(self, node: Node, topic: str, *, stays: bool = False) -> None:
@@ -121,13 +111,12 @@ class ExclusivePublisher:
         """
         Refuse to go on when another publisher has sent a block, with a ConfigError.
 
-        The thread that sends calls this.  The search lasts until `TOGETHER` after the right to
-        drive was granted: two nodes that ask for it at the same moment hear each other only when
-        both send.
+        The thread that sends calls this.  The search ends `TOGETHER` after the right to drive was
+        granted: two nodes that ask at the same moment hear each other only when both send.
         """
         with self._lock:
             listener = self._listener
-            # one foreign block is enough: blocks may come faster than they are taken
+            # one foreign block is enough; a flood of blocks would never end this loop
             while listener and self._heard <= self._sent:
                 if listener.handle.take_message(Float64MultiArray, True) is None:
                     break

@@ -13,15 +13,14 @@ and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its li
 ``~/learn`` repeats the last reference, and corrects the voltage by the measured error, until the
 error stops falling.  A further call goes on from the best repetition.
 
-With `axes` the node follows `reference_<name>` on `voltage_<name>`, too, and makes up for what the
-axes do to one another; shared modes are inverted for all axes together.  A block of `reference`
-waits up to `PATIENCE` for those of other axes at the same t; an axis without a reference rests.
-Another model waits until the next ``~/start`` or ``~/learn``.
+With `axes` the node follows `reference_<name>` on `voltage_<name>`, too.  The inverse cancels the
+coupling of the axes.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
+axes at the same t; an axis without a reference rests.
 
-With `follow` an observer of each axis finds offset, creep of earlier motion, and gain in its
-displacement, and the node corrects the voltage by them.
-A refined model takes over while the stage moves, with the memory of a run from the start.  The
-voltage does not step.
+With `follow` an observer finds offset, creep of earlier motion, and gain from the displacement of
+each axis.  The node corrects the reference by them before the inverse.  A new model of one axis
+takes over while the stage moves, in the state of a run from the start; the voltage does not step.
+A new model of several axes waits until the next ``~/start`` or ``~/learn``.
 
 | in the reference | what happens | status |
 |---|---|---|
@@ -33,7 +32,7 @@ from the stage, as in micrometres | the block is refused | WARN |
 | out of reach | the voltage stays at its limit | WARN |
 | modes that run away | the node ramps to rest and fails | WARN |
 
-Without displacement the node drives on, warns, and has no tracking error.
+If no displacement comes, the node drives on and warns; the tracking error is missing then.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ LIMITED = f'the stage is off by {MOST:.0%} of its stroke or more: is the sensor 
 
 
 class FeedforwardNode(DrivingNode):
-    """Follows a reference with the inverse of a model."""
+    """Drives the stage along a reference by the inverse of a model."""
 
     executable = 'feedforward'
 
@@ -111,9 +110,6 @@ class FeedforwardNode(DrivingNode):
 
     # parameters and models
 
-    def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
-        return guard_settings(values or self.values, self._rate_of_clock)
-
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse limits that are crossed or in use, and a model file that is not there."""
         if name == 'model':
@@ -136,6 +132,9 @@ class FeedforwardNode(DrivingNode):
         # the loader keeps the newest wish, which is the file
         if path := changed.get('model'):
             self._loader.load_file(path)
+
+    def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
+        return guard_settings(values or self.values, self._rate_of_clock)
 
     def _prepared(self, model: Model) -> Prepared:
         # runs in the thread of the loader
@@ -213,7 +212,7 @@ class FeedforwardNode(DrivingNode):
         self._wanted.reset(self._tracker.rest[1:])
         return self._tracker
 
-    # the reference
+    # blocks of the reference and of displacement
 
     def _on_reference(
         self, tail: str, message: Float64MultiArray, info: Mapping[str, Any]
@@ -246,7 +245,6 @@ class FeedforwardNode(DrivingNode):
     def _take_complete(self) -> None:
         """Take the blocks of the reference whose further axes have come or are overdue."""
         heard = self._references.items()
-        # nobody wants these axes to move
         resting = [tail for tail, x in heard if tail and not x.get_publisher_count()]
         for block in self._wanted.join.complete(
             lambda since: self._looks.is_over(since, PATIENCE), resting
@@ -280,11 +278,6 @@ class FeedforwardNode(DrivingNode):
             self._faults.note('clipped', about, drive.clipped)
         self._tell(self._errors.wanted(drive.t, drive.wanted, self._segment))
 
-    def _played(self, voltage: Samples, wanted: Samples) -> None:
-        self._send(voltage.t, voltage.values, voltage.segment)
-        self._segment = voltage.segment
-        self._tell(self._errors.wanted(wanted.t, wanted.values, wanted.segment))
-
     def _on_displacement(self, tail: str, message: Float64MultiArray) -> None:
         # a slow stage may answer the last blocks when the node is at rest already
         is_waiting = self._errors.each[tail].matcher.is_waiting
@@ -309,8 +302,10 @@ class FeedforwardNode(DrivingNode):
         for block in errors:
             self._tracking_errors[block.quantity].publish(to_message(block))
 
+    # the timer
+
     def work(self) -> str:
-        """Watch for the end of a reference, or repeat it."""
+        """Play a repetition, or wait for the end of the reference, every `PERIOD`."""
         self._looks.look()
         tracker, learner = self._tracker, self._learner
         if self._state == 'waiting' or tracker is None:
@@ -334,6 +329,11 @@ class FeedforwardNode(DrivingNode):
         else:
             self._begin_ramp()
         self.report_state()
+
+    def _played(self, voltage: Samples, wanted: Samples) -> None:
+        self._send(voltage.t, voltage.values, voltage.segment)
+        self._segment = voltage.segment
+        self._tell(self._errors.wanted(wanted.t, wanted.values, wanted.segment))
 
     # reports
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write events of a node to its log, without repeating problems that last."""
+"""Write events of a node to its log, each lasting problem once, and keep its recent faults."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Journal:
         self._patterns: dict[str, float] = {}
 
     def tell(self, text: str, level: bytes = DiagnosticStatus.OK) -> None:
-        """Write a single event, of a level as in diagnostic_msgs/DiagnosticStatus."""
+        """Write an event; `level` is a level of diagnostic_msgs/DiagnosticStatus."""
         line = one_line(text)
         with self._lock:
             lines = _fresh(self._lines)
@@ -89,7 +89,7 @@ class Journal:
             self._write(line, level)
 
     def warn(self, text: str, level: bytes = DiagnosticStatus.WARN) -> None:
-        """Write a problem that may last, and comes again and again with other numbers."""
+        """Write problems, separated by ``; ``; leave out those written within `QUIET`."""
         new = []
         with self._lock:
             patterns = _fresh(self._patterns)
@@ -104,7 +104,7 @@ class Journal:
             self._write('; '.join(new), level)
 
     def _write(self, line: str, level: bytes) -> None:
-        # rclpy knows a call by its place, and takes one severity from each
+        # rclpy allows one severity for each line of code that calls a logger
         if level == DiagnosticStatus.OK:
             self._logger.info(line)
         elif level == DiagnosticStatus.WARN:

@@ -105,16 +105,9 @@ class LabNode(ParameterNode):
         """
         Publish the latched status: a `state` in one word, its progress [%] and a text for people.
 
-        The message is a short form of the text that fits ``ros2 topic echo``.
-
-        Parameters
-        ----------
-        brief : str, optional
-            Short form of the text, a number first; default: the progress and the text.
-        problems : str, optional
-            Part of the text that goes to the log as a warning; default: the whole text.
-        **values
-            Further numbers.
+        The message fits ``ros2 topic echo``: `brief` with a number first, by default the progress
+        and the text.  A lasting warning logs `problems`, by default the text.  `values` are
+        further numbers.
         """
         if not brief:
             # a program may be called 3peaks
@@ -166,7 +159,7 @@ class LabNode(ParameterNode):
         """
         Offer a Trigger service ``~/name``.
 
-        The handler starts the work and returns the answer; it raises `PiezoIdentError` to refuse.
+        The handler starts the work and returns the answer; a `PiezoIdentError` refuses the call.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -242,7 +235,7 @@ def run(make: Callable[[], LabNode]) -> int:
     node, code = None, 0
     try:
         node = make()
-        # a full collection of all that the imports made would stop the node for tens of blocks
+        # a garbage collection of all imported objects would stop the node for tens of blocks
         gc.freeze()
         node.introduce()
         ENDING.unfinished, ENDING.patience = f'{node.get_name()} was closed', node.patience

@@ -1,7 +1,18 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Model node: prediction, band, residual and estimate of each block, and the preview."""
+"""
+Model node: predicts the displacement, and estimates it with the sensor.
+
+- A block of `voltage` gives blocks of `prediction` and `prediction_band` at the same t.  With
+  `axes` the block waits up to `PATIENCE` for the voltages of the other axes.
+- A block of `displacement` gives a block of `residual` for the predicted samples in it.
+- A sample of `estimate` follows when the displacement `horizon` samples before has come, or is
+  given up.
+- All signals go into `preview`, and the corrections of the estimate into `corrections`.
+
+A new model, from the parameter or the topic `model`, takes over between two blocks.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +51,7 @@ PATIENCE, LOOK = 0.2, 0.05
 
 
 class ModelNode(LabNode):
-    """Predicts the displacement, and warns when the stage moves differently."""
+    """Predicts the displacement, and warns when it differs from the measured displacement."""
 
     executable = 'model'
 
@@ -96,6 +107,8 @@ class ModelNode(LabNode):
         on_message = functools.partial(self._on_block, what, tail)
         return self.create_subscription(Float64MultiArray, f'{what}{tail}', on_message, STREAM)
 
+    # parameters and models
+
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse a missing model file; ``~/status`` reports faults inside a file."""
         if name == 'adapt' and hasattr(self, '_predictor'):
@@ -136,8 +149,21 @@ class ModelNode(LabNode):
         self._source, self._refusal = source, ''
         self._models += 1
         if self._models > 1:
-            # the state stays the same, so the status writes no line
+            # the status logs a change of the state alone
             self.journal.tell(f'predicting: model {self._models} is taken over, {source}')
+
+    # services
+
+    def _accept(self) -> str:
+        said, refused = dict[str, str](), dict[str, str]()
+        for tail, one in self._comparisons.items():
+            try:
+                said[tail] = one.corrector.accept()
+            except DataError as error:
+                refused[tail] = str(error)
+        if not said:
+            raise DataError(self._joined(refused))
+        return self._joined(said)
 
     def _save(self) -> str:
         each = self._comparisons.items()
@@ -151,16 +177,7 @@ class ModelNode(LabNode):
     def _restore(self) -> str:
         return self._joined({k: x.corrector.restore() for k, x in self._comparisons.items()})
 
-    def _accept(self) -> str:
-        said, refused = dict[str, str](), dict[str, str]()
-        for tail, one in self._comparisons.items():
-            try:
-                said[tail] = one.corrector.accept()
-            except DataError as error:
-                refused[tail] = str(error)
-        if not said:
-            raise DataError(self._joined(refused))
-        return self._joined(said)
+    # blocks of voltage and displacement
 
     def _on_block(self, what: str, tail: str, message: Float64MultiArray) -> None:
         begin = time.perf_counter()
@@ -233,7 +250,7 @@ class ModelNode(LabNode):
 
     @property
     def _is_lost(self) -> bool:
-        """Whether blocks arrive and the memory of the plays is not known."""
+        """Whether blocks arrive while the memory of the plays is unknown."""
         known = all(one.is_known for one in self._comparisons.values())
         return bool(np.isfinite(self._predictor.clock.last)) and not known
 
@@ -258,8 +275,10 @@ class ModelNode(LabNode):
                 message.position.extend(values)
             self._joints.publish(message)
 
+    # reports
+
     def _note_problem(self, problem: str) -> None:
-        # a listener may miss a status, so each status names the last few problems
+        # each status names the last few problems, as a listener may miss a status
         self._problems.pop(problem, None)
         self._problems[problem] = time.monotonic()
         self._report_state()

@@ -33,19 +33,11 @@ class ModelLoader(Generic[T]):
     """
     Reads models from files and from the topic `model`.
 
-    A thread reads the models, because reading YAML and compiling take longer than a block.  If
-    several models wait, the thread reads the newest alone.
+    A thread reads the models, because reading YAML and compiling take longer than a block.  Of
+    several waiting models the thread reads the newest alone.
 
-    Parameters
-    ----------
-    node : Node
-    prepare : callable
-        Prepares a model for the node; the thread calls it.
-    take : callable
-        Gets the prepared model and its source, or None and an error.  The executor of the node
-        calls it for each model in turn.
-    done : callable
-        Called after `take` for all loaded models.
+    The thread calls `prepare` with a model.  The executor of the node then calls `take` with the
+    prepared model and its source, or with None and an error, and `done` after all such calls.
     """
 
     def __init__(

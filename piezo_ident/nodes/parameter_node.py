@@ -4,8 +4,9 @@
 """
 Check the arguments and parameters of a node, at its start and while it runs.
 
-ROS silently ignores unknown parameters and arguments.  It also checks each parameter of a request
-alone, against the old values of the others.
+ROS silently ignores unknown parameters and arguments, and checks each parameter of a request
+against the old values of the others.  `ParameterNode` logs the former, and checks a request as a
+whole.
 """
 
 from __future__ import annotations
@@ -96,15 +97,8 @@ class ParameterNode(Node):
     """
     Node that declares its parameters by `Declaration`, and checks them together.
 
-    A subclass refuses values in `refuse` and acts on them in `apply`.
-
-    Attributes
-    ----------
-    values : dict
-        Values of all parameters.
-    wanted : dict
-        Values of all parameters after the request that is being checked.
-    journal : Journal
+    A subclass refuses values in `refuse` and acts on them in `apply`.  `values` holds the values
+    of all parameters, and `wanted` these values if the present request is accepted.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
@@ -179,7 +173,7 @@ class ParameterNode(Node):
 
     def set_parameters(self, parameter_list: list[Parameter]) -> list[SetParametersResult]:
         """
-        Set all parameters at once, or else as many as possible, in any order that works.
+        Set all parameters at once, or else each parameter that is accepted, in any order.
 
         A loaded file may move limits that depend on each other.
         """

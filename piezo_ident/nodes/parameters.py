@@ -35,23 +35,11 @@ LATCHED_TOPICS = ('model', 'report')
 @dataclass(frozen=True)
 class Declaration:
     """
-    Declaration of one parameter.
+    Declaration of one parameter, whose type is the type of its default.
 
-    Attributes
-    ----------
-    name : str
-    default : bool, int, float, str or tuple of str
-        The parameter has the type of its default.
-    description : str
-        Meaning, without the unit.
-    unit : str
-        Empty without a unit.
-    low, high : float, optional
-        Range of a number, both ends included.
-    choices : tuple of str
-        Allowed texts; any text if empty.
-    read_only : bool
-        Whether it can only be set when the node starts.
+    `description` is the meaning without the `unit`.  A number lies in the range from `low` to
+    `high`, both included, and a text is one of the `choices`, if there are any.  A `read_only`
+    parameter is set only when the node starts.
     """
 
     name: str
@@ -77,12 +65,7 @@ def _volts(name: str, default: float, text: str) -> Declaration:
 _at_start, _SEEDS = partial(Declaration, read_only=True), 2**31 - 1
 
 _RATE = _at_start(
-    'sample_rate',
-    20000.0,
-    'rate of the sample clock that starts with the excitation',
-    'Hz',
-    1.0,
-    10e6,
+    'sample_rate', 20e3, 'rate of the sample clock that starts with the excitation', 'Hz', 1.0, 1e7
 )
 _LIMITS = (
     _volts('voltage_low', 0.0, 'lowest voltage ever sent or applied'),

@@ -4,13 +4,13 @@
 """
 Player node: replays a bag onto topics with the recorded spacing, or a multiple of it.
 
-Blocks carry their own times, so the replayed samples equal the recorded samples bit by bit at any
-rate.  The log times give order and spacing, on a schedule that counts from its start.  If the
-clock of the log times was set back, the order of the file is kept, as in a record that is read
-from the bag.  The player replays the measured topics unless `topics` names others.
+A replayed message equals the recorded message bit by bit, with its own t, at any `rate`.  The log
+times give order and spacing, on a schedule that counts from its start.  If the clock of the log
+times was set back, the messages keep the order of the file.
 
-The player sends once every topic has as many subscribers as `subscribers` says.  From then on it
-waits for no listener; each listener reports its losses.
+``~/start`` opens the bag and creates a publisher for each of `topics`.  The replay begins when
+every topic has `subscribers` subscribers.  A late listener does not hold up the replay; each
+listener reports its losses.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Replay:
 
 
 class PlayerNode(LabNode):
-    """Replays bags."""
+    """Replays a bag from a thread."""
 
     executable = 'player'
 
@@ -86,9 +86,13 @@ class PlayerNode(LabNode):
         if self.values['autostart']:
             self.start()
 
+    # parameters
+
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse invalid names of topics."""
         return topics_problem(value) if name == 'topics' else None
+
+    # services
 
     def start(self) -> str:
         """
@@ -104,7 +108,7 @@ class PlayerNode(LabNode):
         if self._is_replaying():
             raise PiezoIdentError('replaying already; call stop, and wait until it has ended')
         self._replay = Replay(bag, tuple(with_axes(self.values['topics'], self.values['axes'])))
-        # a daemon thread, since an end while it searches a large bag loses nothing
+        # a daemon thread: an end of the node during the look through a large bag loses nothing
         self._thread = threading.Thread(
             target=self._work, args=(self._replay,), name='replay', daemon=True
         )
@@ -120,23 +124,6 @@ class PlayerNode(LabNode):
 
     def _is_replaying(self) -> bool:
         return self._thread is not None and self._thread.is_alive()
-
-    def close(self) -> None:
-        """End the replay before the node ends."""
-        if self._replay is not None and self._thread is not None:
-            self._replay.stop.set()
-            self._thread.join(PATIENCE)
-
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return counts, rate and problems of the replay."""
-        replay = self._replay
-        rate = self._rate.of(replay.messages if replay else 0)
-        values = {**self._numbers(), 'rate': f'{rate:.1f}'}
-        if replay is not None and replay.failure:
-            return ERROR, replay.failure, values
-        if replay is not None and replay.slipped > 0.1:
-            return WARN, f'slower than asked by {replay.slipped:.1f} s; lower the rate', values
-        return OK, 'ready', values
 
     # the replay, in a thread of its own
 
@@ -271,6 +258,8 @@ class PlayerNode(LabNode):
         parts = [about, *map(str, clock.faults), early]
         self._report('done', '; '.join(filter(None, parts)), level, 100.0)
 
+    # reports
+
     def _numbers(self) -> dict[str, Any]:
         replay = self._replay or Replay('', ())
         return {
@@ -284,18 +273,35 @@ class PlayerNode(LabNode):
         brief = f'{progress:.0f} %: {message}' if state == 'playing' else ''
         self.report_status(state, progress, message, level, brief=brief, **self._numbers())
 
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return counts, rate and problems of the replay."""
+        replay = self._replay
+        rate = self._rate.of(replay.messages if replay else 0)
+        values = {**self._numbers(), 'rate': f'{rate:.1f}'}
+        if replay is not None and replay.failure:
+            return ERROR, replay.failure, values
+        if replay is not None and replay.slipped > 0.1:
+            return WARN, f'slower than asked by {replay.slipped:.1f} s; lower the rate', values
+        return OK, 'ready', values
+
+    def close(self) -> None:
+        """End the replay before the node ends."""
+        if self._replay is not None and self._thread is not None:
+            self._replay.stop.set()
+            self._thread.join(PATIENCE)
+
 
 def chosen_topics(
     bag: Bag, wanted: Sequence[str], resolve: Callable[[str], str]
 ) -> dict[str, str]:
     """
-    Choose topics of an open bag; return their full names here by their names in the bag.
+    Choose topics of an open bag; map the name of each in the bag to its name on the graph.
 
-    The full name of a `wanted` topic here, which `resolve` gives, selects the topic of the bag.
-    Without a match the end of the name does, so that a recording of one namespace can be replayed
-    in another namespace; without that the quantity of the blocks.
+    `resolve` gives the name of a `wanted` topic on the graph.  The first rule with a match
+    decides: the same name in the bag; the same end of the name, for a recording of another
+    namespace; the quantity of the blocks.
 
-    DataError when a topic is not in the bag, or more than one could be meant.
+    DataError if a wanted topic has no match or several.
     """
     topics = sorted({c.topic for c in bag.connections})
     chosen: dict[str, str] = {}

@@ -4,9 +4,9 @@
 """
 Recorder node: writes the serialised messages of topics to a bag, byte by byte.
 
-The executor would take 0.3 ms for each message.  The subscriptions therefore bypass it: a thread
-empties them some fifty times a second and writes the bag.  The log time of a message is the time
-at which the middleware received it, independent of thread and disk.
+The executor would take 0.3 ms for each message.  From ``~/start`` to ``~/stop`` a thread
+therefore empties the subscriptions every `POLL` and writes the bag.  The log time of a message is
+the time at which the middleware received the message, independent of thread and disk.
 
 The recorder subscribes to the topics of the graph before they have a publisher.  It subscribes to
 any other topic once a publisher gives the type.  A subscription requests the QoS that all
@@ -75,6 +75,8 @@ class RecorderNode(LabNode):
         if self.values['autostart']:
             self.start()
 
+    # parameters
+
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse invalid names of topics and folders."""
         if name == 'output':
@@ -84,6 +86,8 @@ class RecorderNode(LabNode):
                 return f'output must name a folder, without .mcap or .db3, got {value!r}'
             return home_problem(value)
         return topics_problem(value) if name == 'topics' else None
+
+    # services
 
     def start(self) -> str:
         """
@@ -112,29 +116,13 @@ class RecorderNode(LabNode):
         recording.end.set()
         return f'closing {recording.path or recording.output}; see ~/status'
 
-    def close(self) -> None:
-        """Close the bag before the node ends."""
-        if self._recording is not None:
-            self._recording.end.set()
-        if self._thread is not None:
-            self._thread.join(END)
-
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return counts, rate and problems of the recording."""
-        recording = self._recording
-        rate = self._rate.of(recording.messages if recording else 0)
-        values = {**self._numbers(), 'rate': f'{rate:.1f}'}
-        if recording is not None and recording.failure:
-            return ERROR, recording.failure, values
-        lost = self._lost()
-        if lost:
-            return WARN, f'{lost} messages were sent and not received', values
-        return OK, 'recording' if self._is_recording() else 'not recording', values
+    def _is_recording(self) -> bool:
+        return self._recording is not None and not self._recording.over.is_set()
 
     # subscriptions, in the executor's thread
 
     def _look(self) -> None:
-        """Follow the publishers during a recording."""
+        """Subscribe to new publishers during a recording."""
         recording, subscriptions = self._recording, self._inputs
         if recording is None or subscriptions is None or recording.end.is_set():
             return
@@ -178,14 +166,6 @@ class RecorderNode(LabNode):
             about, level = (f'{about}; {problems}', WARN) if problems else (about, OK)
             self._report('done', about, level, 100.0)
 
-    def _end(self, recording: Recording, subscriptions: RawSubscriptions, failure: str) -> None:
-        recording.failure = failure
-        recording.end.set()
-        recording.over.set()
-        if failure:
-            self._report('failed', failure, ERROR)
-        subscriptions.close()
-
     def _record(
         self, recording: Recording, subscriptions: RawSubscriptions, writer: BagWriter
     ) -> None:
@@ -215,8 +195,15 @@ class RecorderNode(LabNode):
                 about = problems or f'recording to {writer.path}'
                 self._report('recording', about, WARN if problems else OK)
 
-    def _is_recording(self) -> bool:
-        return self._recording is not None and not self._recording.over.is_set()
+    def _end(self, recording: Recording, subscriptions: RawSubscriptions, failure: str) -> None:
+        recording.failure = failure
+        recording.end.set()
+        recording.over.set()
+        if failure:
+            self._report('failed', failure, ERROR)
+        subscriptions.close()
+
+    # reports
 
     def _lost(self) -> int:
         return 0 if self._inputs is None else self._inputs.lost
@@ -234,3 +221,22 @@ class RecorderNode(LabNode):
         numbers = self._numbers()
         brief = f'{numbers["messages"]} messages: {message}' if state == 'recording' else message
         self.report_status(state, progress, message, level, brief=brief, **numbers)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return counts, rate and problems of the recording."""
+        recording = self._recording
+        rate = self._rate.of(recording.messages if recording else 0)
+        values = {**self._numbers(), 'rate': f'{rate:.1f}'}
+        if recording is not None and recording.failure:
+            return ERROR, recording.failure, values
+        lost = self._lost()
+        if lost:
+            return WARN, f'{lost} messages were sent and not received', values
+        return OK, 'recording' if self._is_recording() else 'not recording', values
+
+    def close(self) -> None:
+        """Close the bag before the node ends."""
+        if self._recording is not None:
+            self._recording.end.set()
+        if self._thread is not None:
+            self._thread.join(END)

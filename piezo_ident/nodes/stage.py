@@ -5,8 +5,8 @@
 Stage node: simulates a stage sample by sample, at any block size.
 
 Each block of `voltage` passes the guard (`piezo_ident.live.guard`) and drives the stage.  The node
-answers by a block of `displacement` with the same t and segment, also if the guard has altered the
-command.  `applied_voltage` is the voltage after the guard, before the converter rounds it.
+answers by a block of `displacement` and a block of `applied_voltage`, with the same t and segment.
+`applied_voltage` is the voltage after the guard, before the converter rounds it.
 
 A second axis has a guard and topics of its own: `voltage_b`, `displacement_b`,
 `applied_voltage_b`.  A block of `voltage` waits for the block of `voltage_b` with the same t, for
@@ -82,7 +82,7 @@ _WHY = {
 
 
 class StageNode(LabNode):
-    """Simulates a stage on the topics of a real one."""
+    """Simulates a stage on the topics of a driver."""
 
     executable = 'stage'
 
@@ -130,16 +130,7 @@ class StageNode(LabNode):
         for v in ([rest] * 2, [rest, math.nan]):
             run.process(self._command([guard.process(v).voltage] * len(self._tails)))
 
-    def _command(self, voltages: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Stack voltages for the stage: a vector for one axis, a matrix for several."""
-        return voltages[0] if len(voltages) == 1 else np.column_stack(voltages)
-
-    @property
-    def _is_at_rest(self) -> bool:
-        return all(guard.is_at_rest for guard in self._axis_guards)
-
-    def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
-        return guard_settings(values or self.values, self.sample_rate)
+    # parameters
 
     def refuse(self, name: str, value: Any) -> str | None:
         """Refuse limits that are crossed, and a rest outside of them."""
@@ -156,11 +147,16 @@ class StageNode(LabNode):
         if self._sample_clock.head is None and not self._is_at_rest:
             self._begin_ramp()
 
+    def _settings(self, values: Mapping[str, Any] | None = None) -> GuardSettings:
+        return guard_settings(values or self.values, self.sample_rate)
+
     def _longest_gap(self) -> float:
         return min(self.values['silence'], LONGEST_GAP)
 
     def _watch_period(self) -> float:
         return min(0.05, max(0.005, self.values['silence'] / 4))
+
+    # blocks of voltage
 
     def _on_voltage(self, message: Float64MultiArray, info: Mapping[str, Any]) -> None:
         begin = time.perf_counter()
@@ -240,12 +236,6 @@ class StageNode(LabNode):
                 self._faults.note(why, f'{n} {_WHY[why]}', n)
         return applied.voltage
 
-    def _publish_applied(
-        self, t: NDArray[np.float64], voltages: Sequence[NDArray[np.float64]], segment: str
-    ) -> None:
-        for tail, publisher, v in zip(self._tails, self._applied, voltages, strict=True):
-            publisher.publish(to_message(Samples(t, v, segment, f'voltage{tail}')))
-
     def _move(self, voltages: Sequence[NDArray[np.float64]], segment: str) -> None:
         """Apply a voltage that was not commanded, and publish it as applied."""
         self._run.process(self._command(voltages))
@@ -254,6 +244,18 @@ class StageNode(LabNode):
             t = np.arange(self._tick, self._tick + cut[0].size) / self.sample_rate
             self._publish_applied(t, cut, segment)
             self._tick += cut[0].size
+
+    def _publish_applied(
+        self, t: NDArray[np.float64], voltages: Sequence[NDArray[np.float64]], segment: str
+    ) -> None:
+        for tail, publisher, v in zip(self._tails, self._applied, voltages, strict=True):
+            publisher.publish(to_message(Samples(t, v, segment, f'voltage{tail}')))
+
+    def _command(self, voltages: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Stack voltages for the stage: a vector for one axis, a matrix for several."""
+        return voltages[0] if len(voltages) == 1 else np.column_stack(voltages)
+
+    # silence
 
     def _on_watch(self) -> None:
         self._looks.look()
@@ -270,10 +272,6 @@ class StageNode(LabNode):
                 self._begin_ramp()
         self._report_state()
 
-    def _end_stream(self) -> None:
-        self._sample_clock.end()
-        self._join.clear()
-
     def _begin_ramp(self) -> None:
         self._state, self._segment = 'ramping', RAMPED
         self._pace = Pace(self.sample_rate, 5 * RAMP_PERIOD)
@@ -288,6 +286,16 @@ class StageNode(LabNode):
             self._state = 'idle'
             self._faults.note('silence', 'no voltage: ramped to rest', 0)
         self._report_state()
+
+    def _end_stream(self) -> None:
+        self._sample_clock.end()
+        self._join.clear()
+
+    @property
+    def _is_at_rest(self) -> bool:
+        return all(guard.is_at_rest for guard in self._axis_guards)
+
+    # reports
 
     def _report_state(self) -> None:
         faults = self._faults.text

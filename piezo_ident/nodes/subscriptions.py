@@ -4,8 +4,8 @@
 """
 Take the messages of subscriptions without the executor.
 
-The executor takes 0.3 ms to hand over one message.  A node that only collects blocks takes them
-itself in a fifth of this time.
+The executor takes 0.3 ms to hand over one message.  Taking a message from its subscription takes
+a fifth of this time, for a node that only collects blocks.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def unspun(
 
 def received(subscription: Any, *, raw: bool) -> Iterator[tuple[Any, Mapping[str, Any]]]:
     """Take the messages of a subscription that the caller empties, with their information."""
-    # one queue at most, or a flood on one topic starves the others
+    # one queue at most: a flood on one topic must not starve the other topics
     for _ in range(STREAM.depth):
         message = subscription.handle.take_message(subscription.msg_type, raw)
         if message is None:
@@ -130,7 +130,7 @@ class _Topic:
     #: publishers, and whether the last two looks saw the same single publisher
     publishers: frozenset[bytes] = frozenset()
     is_single: bool = False
-    #: whether the last message came from the only publisher since
+    #: whether the topic has had a single publisher since its last message
     is_followed: bool = False
 
     def note(self, number: int) -> None:
@@ -147,13 +147,9 @@ class _Topic:
 
 class RawSubscriptions:
     """
-    Subscriptions of a recording: serialised messages, with the QoS that publishers offer.
+    Subscriptions of a recording to `topics`, by full names: serialised messages.
 
-    Parameters
-    ----------
-    node : Node
-    topics : iterable of str
-        Full names.
+    A subscription requests the QoS that all publishers of its topic offer.
     """
 
     def __init__(self, node: Node, topics: Iterable[str]) -> None:
