@@ -2,12 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Drive one axis along a wanted motion, block by block, through new references and new models.
+Drive one axis along a reference, block by block, through new references and new models.
 
-An inverse of the axis, or of all axes, makes the voltage.  The axis joins a new reference along a
-raised cosine in metres, from the position of the stage.  A new model takes over in the state that
-it would have if it had run from the start.  The axis then joins the reference from the position
-that the new model predicts, so the voltage does not jump.  A guard limits the voltage in the end.
+For each block of the reference `piezo_ident.live.tracker` calls
+
+1. `AxisDrive.joined`, which joins a new reference along a raised cosine in metres, from the
+   position of the stage;
+2. `AxisDrive.corrected`, which corrects the goal of the inverse by the measured error;
+3. the inverse of the axis, or of all axes, which makes the voltage;
+4. `AxisDrive.drive`, which limits the voltage by a guard.
+
+A new model takes over in the state of a run from the start.  The axis then joins the reference
+from the position that the new model predicts, so the voltage does not jump.
 """
 
 from __future__ import annotations
@@ -37,7 +43,8 @@ class Drive:
     Attributes
     ----------
     t, v, wanted : ndarray, shape (n,)
-        Time on the clock of the voltage [s], voltage [V], and wanted displacement then [m].
+        Time on the clock of the voltage [s], voltage [V], and wanted displacement at this time
+        [m].
     clipped : int
         Number of samples at which a limit keeps the stage from the wanted displacement.
     """
@@ -50,7 +57,11 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Successor:
-    """Inverse of a new model after `count` samples of voltage, and a free run of the model."""
+    """
+    A new model in the state after `count` samples of voltage, as an inverse and as a free run.
+
+    The free run serves the follower; it is None while `follow` is ``'off'``.
+    """
 
     inverse: LiveInverse
     count: int
@@ -58,7 +69,7 @@ class Successor:
 
 
 def check_rate(model: StageModel, settings: GuardSettings) -> None:
-    """Refuse a model of another rate than that of the reference with a ModelError."""
+    """Raise ModelError for a model whose rate is not the rate of the reference."""
     if abs(model.sample_rate / settings.sample_rate - 1.0) > 1e-6:
         raise ModelError(
             f'the reference is sampled at {settings.sample_rate:g} Hz, the model holds for '
@@ -138,15 +149,15 @@ class AxisDrive:
         return self._join.process(raw)
 
     def corrected(self, wanted: Array, goal: Array) -> Array:
-        """Correct the goal of the model [m], which moves the stage along the wanted motion [m]."""
+        """Return the corrected goal of the inverse [m]; keep the wanted motion [m] for `drive`."""
         self._wanted = np.append(self._wanted, wanted)
         return goal if self.follower is None else self.follower.process(goal, self._preview + 1)
 
     def drive(self, v: Array, clipped: Mask) -> Drive:
-        """Send the next voltage [V] of the inverse, with the mask of its clipped samples."""
+        """Send the next voltage [V] of the inverse; `clipped` marks samples at a limit."""
         t, v = self.play(v)
         now, self._wanted = self._wanted[: v.size], self._wanted[v.size :]
-        # an axis that nobody moves has no reference that could be out of reach
+        # an axis without a reference stays at the start, and misses no motion
         missed = int(np.count_nonzero(clipped & (now != self._start)))
         return Drive(t, v, now, missed)
 

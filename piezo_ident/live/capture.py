@@ -4,9 +4,9 @@
 """
 Keep incoming blocks for a record, within bounds of time and memory.
 
-`piezo_ident.record.join` and `piezo_ident.record.assemble` make the record, as that of a bag, and
-deal with faulty samples.  A capture also reports unreadable messages, and the time that it dropped
-to stay within the bounds.
+`piezo_ident.record.join` and `piezo_ident.record.assemble` make the record and deal with faulty
+samples, as for a bag.  A capture also reports unreadable messages, and the time that it dropped to
+stay within the bounds.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class _Topic:
 
     def __init__(self) -> None:
         self.stream, self.clock = BlockStream(), BlockClock()
-        # number of samples at each restart of the clock; number of dropped samples
+        # number of samples before each restart of the clock
         self._runs: list[int] = []
         self.dropped = self._newest = self.not_finite = 0
         # samples of ramps to rest between commands, and of a ramp since the last command
@@ -149,7 +149,7 @@ class _Topic:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of a capture at one moment, whose record another thread may make later."""
+    """A copy of a capture at one moment; another thread may make its record later."""
 
     streams: Mapping[str, BlockStream]
     faults: tuple[Fault, ...] = ()

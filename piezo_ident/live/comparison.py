@@ -18,7 +18,7 @@ from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.blocks import Samples
 
 #: least share of the predictions of a second that meet a displacement, and number of seconds
-#: allowed below it: the first second of a stream is incomplete
+#: that may stay below this share, as the incomplete first second of a stream
 MET, PATIENCE = 0.5, 1
 
 
@@ -31,9 +31,12 @@ class AxisComparison:
     window : float
         Time over which the live errors are taken [s].
     corrector : Corrector
-    publish, tell, note : callable
-        Get the name of a quantity, ``residual`` or ``estimate``, and a block of it; the
-        corrections of the estimate by their names; a doubt about the readings as text.
+    publish : callable
+        Gets the name of a quantity, ``residual`` or ``estimate``, and a block of this quantity.
+    tell : callable
+        Gets the corrections of the estimate by their names.
+    note : callable
+        Gets a doubt about the readings as text.
     knows : callable
         Returns whether the run of the model knows the memory of its plays.
 
@@ -84,7 +87,7 @@ class AxisComparison:
         return self._knows() or self.corrector.knows_memory
 
     def drove(self, v: Array) -> None:
-        """Take the next voltages [V], shape (n,), for `room`."""
+        """Take the next voltages [V], shape (n,), of which `look` makes `room`."""
         numbers, (low, high) = v[np.isfinite(v)], self._ends
         self._ends = float(numbers.min(initial=low)), float(numbers.max(initial=high))
 
@@ -133,7 +136,7 @@ class AxisComparison:
 
     def look(self, is_silent: bool) -> str:
         """
-        End a second; return why its predictions cannot be compared, or ''.
+        End a second; return the reason why its predictions cannot be compared, or ''.
 
         `is_silent` says that voltage came without a prediction.
         """
@@ -164,7 +167,7 @@ class AxisComparison:
 
     def verdict(self, ratio: float) -> tuple[str, str]:
         """
-        Return a reason to identify again, or else the corrections; both may be empty.
+        Return a reason to identify again and '', or '' and the corrections; both may be empty.
 
         `ratio` is the live error over the error at identification from which to identify again.
         """

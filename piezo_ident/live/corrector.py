@@ -48,8 +48,8 @@ GAIN = {
 LEARNT = ('learnt/gain', 'learnt/loop')
 #: corrections published per second of the stream
 RATE = 50.0
-#: largest change of the band of unknown plays within a block from which the model learns, as a
-#: share of the span: plays that become known explain the remaining error
+#: largest change of the band of unknown plays in a block from which the model learns, as a share
+#: of the span.  In other blocks the error is due to these plays.
 SETTLED = 1e-5
 #: smallest creep from earlier motion that is mentioned, as a share of the span
 FAINT = 1e-4
@@ -80,7 +80,7 @@ class Estimated:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """A waiting block: first tick, prediction, voltage, and what is felt of other axes [m]."""
+    """A waiting block: first tick, prediction, voltage, and motion by other axes [m]."""
 
     tick: int
     prediction: Samples
@@ -97,7 +97,7 @@ class Corrector:
     horizon : int, optional
         [samples]
     gain, drift : bool, optional
-        Whether the gain is followed, too, and whether as one that drifts.
+        Whether the gain is followed, too, and whether it is followed as a drifting gain.
     adapt : {'off', 'gain', 'hysteresis'}, optional
         Part of the model that the corrector learns.  The observer then corrects the free run of
         the learnt model.
@@ -146,7 +146,7 @@ class Corrector:
         return abs(self._model.scaling.Y) if self._model is not None else np.inf
 
     def set_model(self, model: StageModel, recalled: Recalled = StageModel.stream) -> None:
-        """Take the model that predicts from now on; at rest when `recalled` is absent."""
+        """Take the model that predicts from now on; `recalled` gives its run up to now."""
         self._model = model
         self._learn_anew(recalled)
 
@@ -160,7 +160,7 @@ class Corrector:
         *,
         recalled: Recalled = StageModel.stream,
     ) -> None:
-        """Change the settings, see `Corrector`, and begin anew."""
+        """Change the settings, see `Corrector`, and forget the observer and the learnt part."""
         self._horizon, self._gain, self._drift, self._adapt = horizon, gain, drift, adapt
         self._accept_after = accept_after
         self._learn_anew(recalled)
@@ -233,8 +233,8 @@ class Corrector:
         self._observer: Observer | None = None
         self._waiting: list[_Block] = []
         self._measured: list[tuple[Integers, Array]] = []
-        # the next tick of the voltage, the newest tick with displacement, and the newest tick
-        # whose displacement has come or is given up
+        # next tick of the voltage, newest tick with displacement, and newest tick whose
+        # displacement has come or is given up
         self._next, self._told, self._decided = 0, -1, -1
         self._last: Array | None = None
         # motion by other axes, a horizon before the next sample
@@ -336,7 +336,7 @@ class Corrector:
         return done
 
     def _learnt_run(self, block: _Block, y: Array) -> Array:
-        """Run the learnt model freely; it learns from displacement y a horizon before."""
+        """Return the free run of the learnt model, which learns from y a horizon before [m]."""
         free = block.prediction.values - block.felt
         ticks = np.arange(block.tick, block.tick + free.size, dtype=np.float64)
         t = self._clock.begin + ticks * self._clock.period

@@ -4,10 +4,10 @@
 """
 Keep the part of a voltage on which the state of a new model depends.
 
-A new model takes over in the state that it would have if it had run from the start.  Its plays
-remember extremes of the voltage since the start of the run.  A loop inside a later stroke leaves
-no trace in the plays (the wiping-out property), so few turning points matter.  The history keeps
-these turning points, the samples just before each, and the last seconds in full.
+A new model takes over in the state of a run from the start.  Its plays remember extremes of the
+voltage since the start of the run.  A loop inside a later stroke leaves no trace in the plays (the
+wiping-out property), so few turning points matter.  The history keeps these turning points, the
+samples just before each, and the last seconds in full.
 """
 
 from __future__ import annotations

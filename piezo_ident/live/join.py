@@ -23,8 +23,8 @@ from piezo_ident.record.blocks import Samples, SHORTEST
 
 #: most samples that are kept
 MOST = 1_000_000
-#: time for which an axis is not silent after a block of it [s]: the middleware may tell of a
-#: publisher later than it brings its first block (taste)
+#: time after a block in which its axis is not silent [s] (taste).  The first block of a publisher
+#: may come before the middleware lists the publisher.
 HEARD = 1.0
 
 
@@ -50,7 +50,7 @@ def held(x: Array, before: float) -> Array:
 
 class Join:
     """
-    Blocks of the first axis, each of which waits for the other axes at the same times.
+    Blocks of the first axis, which wait for the samples of the other axes at the same times.
 
     Parameters
     ----------
@@ -109,8 +109,9 @@ class Join:
         """
         Yield the blocks of the first axis whose partners have come, with note and silent axes.
 
-        `is_over` says whether a block that came at a time [s] has waited long enough.  No block
-        waits for a `silent` axis, whose topic no node publishes, unless it was heard lately.
+        `is_over` says whether a block that came at a time [s] has waited long enough.  The topic
+        of a `silent` axis lacks a publisher.  A block waits for this axis only within `HEARD`
+        after the last block of the axis.
         """
         while self._waiting:
             samples, note, since = self._waiting[0]

@@ -76,7 +76,7 @@ class LiveLearning:
         self._measured: Array = np.full(v.shape, np.nan)
 
     def measured(self, samples: Samples, tick: int, axis: int = 0) -> None:
-        """Take displacement of an axis; `tick` is the first sample of the repetition."""
+        """Take a block of displacement of an axis; the repetition began at the sample `tick`."""
         k = np.rint(samples.t * self.settings.sample_rate).astype(np.int64) - tick - self._first
         inside = (k >= 0) & (k < self._measured.shape[1])
         self._measured[axis, k[inside]] = samples.values[inside]
@@ -108,10 +108,10 @@ class LiveLearning:
 
 class Learner:
     """
-    Plays the repetitions that a `LiveLearning` plans, at `most` so many.
+    Plays at most `most` repetitions of a `LiveLearning`, each planned in a thread.
 
-    A thread calls `make` for the plan.  `play` gets a block of voltage and one of wanted
-    displacement.
+    The first thread calls `make` for the `LiveLearning`.  `play` gets a block of voltage and a
+    block of wanted displacement.
 
     Attributes
     ----------

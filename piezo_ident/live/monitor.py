@@ -70,8 +70,8 @@ class Matcher:
     """
     Joins two streams of blocks on time, in any order and with blocks of any size.
 
-    A restarted clock repeats the times of the old run, so a block waits until the other stream has
-    restarted, too.
+    A restarted clock repeats the times of the old run.  A block after a restart therefore waits
+    until the other stream has restarted, too.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Matcher:
 
     @property
     def late(self) -> int:
-        """Number of measured samples that came again or out of turn."""
+        """Number of measured samples that are repeated or late."""
         return self._measured.clock.late
 
     @property
@@ -215,8 +215,8 @@ class TrackingError:
     """
     Wanted minus measured displacement, block by block.
 
-    `live` has the rms over a time `window` [s]; `quantity` is the name of the errors.  Wanted
-    blocks wait in the `matcher` for their measured displacement.
+    `live` has the rms over a time `window` [s], and `quantity` is the name of the error in its
+    blocks.  Wanted blocks wait in the `matcher` for their measured displacement.
     """
 
     def __init__(self, window: float, quantity: str = 'tracking_error') -> None:

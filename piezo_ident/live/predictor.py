@@ -4,9 +4,9 @@
 """
 Predict the displacement of a running stage, through gaps, restarts and new models.
 
-`AxesRun` runs chains and `ModesRun` shared modes; `Predictor` handles the faults of a stream.
-`piezo_ident.live.history` brings a new model into the state that it would have if it had run from
-the start.
+`Predictor` handles gaps, restarts and faults of the voltage, and keeps its history.  A new model
+takes over in the state of a run from the start, see `piezo_ident.live.history`.  `AxesRun` runs
+the chains of a model, `ModesRun` its shared modes.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Predictor:
     clock : BlockClock
         Counts lost and late samples, and restarts.
     half_width : Samples or None
-        Half width of the band of the last block [m]; None if the model carries no band.
+        Half width of the band of the last block [m]; None for a model without a band.
     felt : ndarray, shape (k, n)
         Motion by other axes in the last prediction [m].
     """
@@ -165,9 +165,9 @@ class Predictor:
     @property
     def memory_known(self) -> bool:
         """
-        Whether the memory of the plays is known.
+        Whether the voltage so far determines the memory of the plays.
 
-        The lower end of the voltage range, or a sweep of shared modes, makes it known until a gap.
+        The lower end of the range or a sweep of shared modes determines the memory, until a gap.
         """
         return self._was_at_rest or (isinstance(self._run, ModesRun) and self._run.stream.is_swept)
 
@@ -224,7 +224,8 @@ class Predictor:
         """
         Predict the displacement [m] for a block of voltage [V], shape (n,), or (k, n) for k axes.
 
-        The result is None if the block is left out, or without a model of the rate of the stream.
+        The result is None for a block that is left out.  It is also None without a model, and with
+        a model of another rate.
 
         A straight line bridges a gap of up to half a second.  A longer gap and a restart begin a
         new run, with the stage at rest.  Repeated and late blocks, and blocks with NaN or infinite

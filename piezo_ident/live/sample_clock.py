@@ -7,15 +7,14 @@ Follow a stream of blocks by its time stamps, and by its publisher.
 `BlockClock` follows a stream of any rate, from any publisher.  `SampleClock` follows a stream of a
 known rate, from one publisher.
 
-A node that drives an amplifier must know how a block relates to its stream.  The block may go on
-where the last block ended, start over, come twice or too late, or belong to another publisher.
-rclpy does not say which publisher sent a message.  It gives the number that the publisher counted
-for the message, and the ids of all publishers of the topic.  The rules are:
+A node that drives an amplifier must know how a block relates to its stream (see `Kind`), and which
+publisher sent the block.  rclpy gives the sequence number of a message, but not its publisher;
+each publisher counts its own messages.  rclpy also gives the ids of all publishers of the topic.
+The rules are:
 
-- Every message belongs to the followed publisher while the topic has no other publisher.
-- Beside other publishers a message belongs to the followed publisher if it carries the next
-  number, and if no other publisher is known to be at that number.  Without numbers the time
-  decides.
+- While the topic has a single publisher, every message belongs to this followed publisher.
+- Amid several publishers a message with the next number belongs to the followed publisher, unless
+  another publisher is known to be at that number.  If numbers are missing, the time decides.
 - Two publishers that start together are at the same number and time.  Their messages cannot be
   told apart and are refused.
 - After a silence the followed publisher may come back.  Another publisher is followed once the
@@ -109,7 +108,7 @@ class SampleClock:
         self.end()
 
     def pause(self) -> None:
-        """Note a silence: only the followed publisher may come back while it exists."""
+        """Note a silence; while the followed publisher exists, it alone may go on."""
         self._is_silent = self._is_silent or self.head is not None
         self._forget()
 
@@ -146,7 +145,7 @@ class SampleClock:
         ----------
         samples : Samples
         sequence : int, optional
-            Number that its publisher gave the message; None if the middleware does not tell.
+            Sequence number of the message by its publisher; None if the middleware lacks it.
         publishers : callable, optional
             Returns the ids (gids) of all publishers of the topic; no ids mean one publisher.
             Called only if a block does not go on, or if others were present at the start.

@@ -4,8 +4,8 @@
 """
 Turn the reference of a stage into its voltage, block by block.
 
-An `AxisDrive` joins, corrects and guards each axis.  `LiveChains` or `LiveModesInverse` makes the
-voltages of all axes.
+An `AxisDrive` of each axis joins and corrects the reference, and guards the voltage.  `LiveChains`
+or `LiveModesInverse` makes the voltages of all axes.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Tracker:
     preview : int, optional
         Samples by which the stage follows the reference later.
     follow : {'off', 'offset', 'gain'}, optional
-        Corrections of each axis by its measured displacement: none, offset and creep from earlier
-        motion, or these and the gain of the axis.
+        Corrections of each axis by its measured displacement: none; offset and creep from earlier
+        motion; or offset, creep and gain.
     axes : sequence of str, optional
         Order of the rows, by the names of the displacements.
 
@@ -100,7 +100,7 @@ class Tracker:
 
     @property
     def followers(self) -> list[Follower]:
-        """What corrects the wanted motion of each axis; empty if `follow` is ``'off'``."""
+        """The follower of each axis; empty if `follow` is ``'off'``."""
         return [one.follower for one in self._each if one.follower is not None]
 
     @property
@@ -147,7 +147,7 @@ class Tracker:
         return Drive(drives[0].t, v, now, sum(drive.clipped for drive in drives))
 
     def _follow(self, t: Array, v: Array) -> None:
-        """Tell the followers what was sent, and what each axis feels of the others."""
+        """Give the followers the sent voltage, and the motion by it and by the other axes."""
         if not (followers := self.followers) or not t.size:
             return
         rows = np.atleast_2d(v)
@@ -206,7 +206,7 @@ def _rows(of_axes: list[Array]) -> Array:
     return np.stack(of_axes) if of_axes[1:] else of_axes[0]
 
 
-#: a model with its tracker, or with what takes over from the tracker at work
+#: a model with a new tracker, or with the successor of the inverse of the present tracker
 Prepared: TypeAlias = tuple[StageModel | MultiAxisModel, Tracker | Successor]
 
 
@@ -221,8 +221,8 @@ def prepared(
     """
     Prepare another model for the axes of a node; any thread may call this.
 
-    A model of one axis becomes the successor of the tracker at work, `now`, if that one has the
-    same settings.
+    A model of one axis becomes a successor inside the present tracker, `now`, if this tracker has
+    the same settings.
 
     Raises
     ------
