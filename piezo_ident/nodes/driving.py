@@ -86,7 +86,9 @@ class DrivingNode(LabNode):
     def _stop(self) -> str:
         if self._state not in DRIVING:
             raise ConfigError('the node does not drive')
-        self._halt('stopped', 'stopped')
+        # a ramp after a fault keeps its reason
+        if self._state != 'stopping':
+            self._halt('stopped', 'stopped')
         return f'ramping to {self.values["rest"]:g} V'
 
     def _on_timer(self) -> None:

@@ -372,6 +372,13 @@ class Idle(FeedforwardNode):
         self.apply(changed)
 
 
+def test_a_stop_during_the_ramp_after_a_fault_keeps_its_reason():
+    node = Idle()
+    node._state, node._end = 'stopping', ('failed', 'somebody drives')
+    assert node._stop() == 'ramping to 0 V'
+    assert node._end == ('failed', 'somebody drives')
+
+
 def test_a_model_that_is_set_together_with_limits_is_the_last_one_to_be_loaded():
     node = Idle()
     node.set(model='new.yaml', voltage_high=5.0)
