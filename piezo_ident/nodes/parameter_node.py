@@ -156,9 +156,9 @@ class ParameterNode(Node):
             return f'{name} must be {" or ".join(declaration.choices)}, got {value!r}'
         if isinstance(value, float) and value != value:
             return f'{name} must be a number, got NaN'
-        bad = [x for x in value if x and role_of(f'v_{x}') != 'v'] if name == 'axes' else []
-        if bad:
-            return f'axes: {bad[0]!r} cannot be the name of an axis'
+        for x in filter(None, value if name == 'axes' else ()):
+            if role_of(f'v_{x}') != 'v' or value.count(x) > 1:
+                return f'axes: {x!r} cannot be the name of an axis, or is named twice'
         try:
             return self.refuse(name, value)
         except PiezoIdentError as error:

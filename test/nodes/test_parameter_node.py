@@ -39,6 +39,7 @@ def test_bad_parameters_at_the_start_end_a_node_with_the_reason(tmp_path):
             ('excitation', 'program', 'nonsense', 'no such program'),
             ('excitation', 'voltage_high', 5.0, 'outside the limits'),
             ('excitation', 'axes', ['um'], "axes: 'um' cannot be the name of an axis"),
+            ('model', 'axes', ['b', 'c', 'b'], "axes: 'b' cannot be the name of an axis, or is"),
             ('stage', 'stage', 'nonsense', 'no such stage'),
             ('stage', 'rest', 11.0, 'rest = 11 V lies outside'),
             ('identifier', 'channels', ['bad name'], "channels: 'bad name'"),
