@@ -24,16 +24,9 @@ class Ending:
     """
     The end of this process.
 
-    Attributes
-    ----------
-    is_wanted : threading.Event
-        Set by a signal.
-    patience : float
-        Time that the process may take to close after a signal [s].
-    on_wanted : callable
-        Called once, in another thread, after `is_wanted` was set.
-    unfinished : str
-        Work that the end of the process would cut off; the exit code is then 1.
+    A signal sets `is_wanted`; another thread then calls `on_wanted` once.  The process may take
+    the time `patience` to close after a signal [s].  `unfinished` names the work that the end of
+    the process would cut off; the exit code is then 1.
     """
 
     def __init__(self) -> None:

@@ -214,7 +214,11 @@ class ParameterNode(Node):
             return SetParametersResult(reason=no_parameter(self, unknown[0]))
         if not wanted:
             return SetParametersResult(successful=True)
-        return super().set_parameters_atomically(wanted)
+        try:
+            return super().set_parameters_atomically(wanted)
+        # the client gets an answer after any failure
+        except Exception as error:  # noqa: BLE001
+            return SetParametersResult(reason=f'failed: {error!r}')
 
     def _validate(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         # two new values may each fit the present values, but not each other

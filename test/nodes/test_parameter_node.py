@@ -6,6 +6,20 @@
 import signal
 
 from graph import Graph, Handle
+from piezo_ident.nodes.parameter_node import ParameterNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+def test_a_request_is_answered_after_any_failure(monkeypatch):
+    def fails(node, parameters):
+        raise OSError('gone')
+
+    monkeypatch.setattr(Node, 'set_parameters_atomically', fails)
+    node = ParameterNode.__new__(ParameterNode)
+    node._declared, node.has_parameter = {}, lambda name: True
+    result = node._set([Parameter('model', value='m.yaml')])
+    assert (result.successful, result.reason) == (False, "failed: OSError('gone')")
 
 
 def test_what_cannot_be_taken_costs_one_line():
