@@ -22,7 +22,7 @@ each axis.  The node corrects the reference by them before the inverse.  A new m
 takes over while the stage moves, in the state of a run from the start; the voltage does not step.
 A new model of several axes waits until the next ``~/start`` or ``~/learn``.
 
-| in the reference | what happens | status |
+| in the streams | what happens | status |
 |---|---|---|
 | layout of no block, stamps off the clock, a block that came before, a second publisher, far \
 from the stage, as in micrometres | the block is refused | WARN |
@@ -31,8 +31,7 @@ from the stage, as in micrometres | the block is refused | WARN |
 | another stream | is joined from where the first one ended | |
 | out of reach | the voltage stays at its limit | WARN |
 | modes that run away | the node ramps to rest and fails | WARN |
-
-If no displacement comes, the node drives on and warns; the tracking error is missing then.
+| no displacement | the node drives on, without a tracking error | WARN |
 """
 
 from __future__ import annotations
@@ -122,7 +121,9 @@ class FeedforwardNode(DrivingNode):
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
-        """Take a model file, another window, or other limits."""
+        """Take a model file, another window or silence, or other limits."""
+        if 'silence' in changed:
+            self._sample_clock.longest_gap = changed['silence']
         if 'window' in changed:
             for one in self._errors.each.values():
                 one.live.window = changed['window']
@@ -362,7 +363,6 @@ class FeedforwardNode(DrivingNode):
         """Return rate, counts of lost and refused samples, head-room, and tracking error."""
         # while the reference pauses, the stage has no block to answer
         if self._state == 'tracking' and self._last - self._answered > SILENT:
-            # the earlier error says nothing about the present
             self._errors.clear()
             self._faults.note('silent', 'no displacement comes from the stage', 0)
         if outliers := self._errors.outliers:

@@ -379,6 +379,13 @@ def test_a_stop_during_the_ramp_after_a_fault_keeps_its_reason():
     assert node._end == ('failed', 'somebody drives')
 
 
+def test_another_silence_counts_in_the_present_stream():
+    node = Idle()
+    node._sample_clock = SimpleNamespace(longest_gap=SILENCE)
+    node.set(silence=PATIENT)
+    assert node._sample_clock.longest_gap == PATIENT and node.wishes == []
+
+
 def test_a_model_that_is_set_together_with_limits_is_the_last_one_to_be_loaded():
     node = Idle()
     node.set(model='new.yaml', voltage_high=5.0)
