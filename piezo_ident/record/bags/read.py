@@ -4,9 +4,10 @@
 """
 Read records from rosbag2 folders and files, mcap or sqlite3, without ROS.
 
-The quantity of its blocks selects a topic, so names may be remapped.  Namespaces distinguish the
-stages of a bag.  A bag and a live capture of the same blocks become the same record.  The bag of a
-killed recorder is refused; with `ReadOptions.recover` its whole messages are read.
+The quantity in the layout of its blocks selects a topic, so topics may be remapped.  Topics of the
+model node do not count as measured.  Namespaces distinguish the stages of a bag.  A bag and a live
+capture of the same blocks become the same record.  The bag of a killed recorder is refused, unless
+`ReadOptions.recover` asks for its whole messages.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def _finished(path: Path, stack: ExitStack) -> Bag:
 
 
 def _has_index(reader: Reader) -> bool:
-    """Return whether every message of an mcap file is in the index; rosbags skips the rest."""
+    """Return whether the index of an mcap file lists every message; rosbags reads no other."""
     storages: list[Any] = getattr(reader.storage, 'storages', [reader.storage])
     for storage in storages:
         chunks = getattr(storage, 'chunks', None)

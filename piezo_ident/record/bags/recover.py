@@ -4,10 +4,10 @@
 """
 Read bags without an index: from the beginning of each file, message by message.
 
-An unfinished bag lacks metadata.yaml or the end of an mcap file, or has the journal of a
-transaction beside an sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all
-committed rows of a database.  Recovery applies journals to copies, and unpacks compressed files
-into copies, so the bag stays as it is.
+An unfinished bag lacks metadata.yaml or the end of an mcap file, or has a journal beside an
+sqlite3 file.  Recovery reads every whole chunk of an mcap file, and all committed rows of a
+database.  The bag stays unchanged: recovery applies journals to copies, and unpacks compressed
+files into copies.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ class Bag:
     """
     An open bag: its folder or file, and topics with types, QoS profiles and message counts.
 
-    `messages` yields the messages of some connections, in the order of their log times if the bag
-    has an index, else in the order of the files.  `start` and `end` are the log times of the first
-    and the last message [ns]; they are equal for an empty bag.  `faults` lists the damage.
+    `messages` yields the messages of some connections: in the order of their log times from a bag
+    with an index, else in the order of the files.  `start` and `end` are the log times of the
+    first and the last message [ns]; they are equal for an empty bag.  `faults` lists the damage.
     """
 
     path: Path

@@ -65,10 +65,10 @@ class BagWriter:
     """
     An open bag, or several one after the other; all calls must come from one thread.
 
-    A recording with a `max_size` [bytes on disk] has several parts.  A part of that size is closed
-    by the first message after a `flush`, which begins the next part: no part is empty.  Each part
-    is a whole bag with all topics.  The parts are numbered in their names; their custom data hold
-    ``part`` and ``recording``.  DataError if a bag cannot be made.
+    A recording with a `max_size` [bytes on disk] has several parts.  When a `flush` finds a part
+    of this size, the next message begins the next part, so no part is empty.  Each part is a whole
+    bag with all topics.  The parts are numbered in their names; their custom data hold ``part``
+    and ``recording``.  DataError if a bag cannot be made.
 
     Parameters
     ----------
