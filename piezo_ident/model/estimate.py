@@ -4,8 +4,8 @@
 """
 Estimate the displacement of a measured record by an observer, as the model node does live.
 
-The node begins at rest, and so does this estimate: its free run uses no displacement, and the
-observer uses displacement that is at least a horizon older than the estimated sample.
+The free run begins at rest, as in the node, and depends on the voltage alone.  The observer uses
+displacement at least a horizon before the estimated sample.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Observe the state of a stage that its voltage leaves unknown, by its measured displacement.
+Correct the free run of a model by the measured displacement.
 
-The free run of a model begins at rest.  A real stage may still creep from earlier motion, its
+The free run of a model begins at rest.  A real stage may still creep from earlier motion.  Its
 sensor may have another zero, and the outputs of its plays may be unknown.  In normalised units
 the displacement is the free run plus
 
@@ -25,9 +25,9 @@ variance that time adds to gamma therefore counts along the path only; at rest g
 same.  The filter refuses a step of the gain at first, as it refuses every step.  The step is
 accepted once the voltage has moved and the refused measurements are proportional to x.
 
-The drift of the gain is followed on request, too: gamma then also grows by delta a second, and
-delta is a random walk that returns to zero.  A ramp of the gain leaves no lag then.  Without a
-sensor, however, the estimate soon errs more: an unknown drift goes on.
+The drift of the gain is followed on request, too.  The gain gamma then also grows by delta a
+second, where delta is a random walk that returns to zero.  The estimate follows a ramp of the gain
+without a lag.  While the sensor is silent, however, the drift goes on and the error grows.
 
 Two hypotheses run side by side, weighted by their likelihood: the zero is unchanged, or it is
 anywhere.  Slow creep and a shifted zero look alike at first.  A wide prior of the zero alone would
@@ -61,19 +61,19 @@ from piezo_ident.operators.chain import Block
 HORIZON = 100
 #: time over which displacement is averaged to one measurement [s]
 GROUP = 1e-3
-#: assumed rms error of a model without a known error, in spans: the error of the paper's model;
-#: and the smallest assumed rms error: a tenth of a bit of its converters
+#: rms error of a model whose error is unknown, in spans: the error of the paper's model.
+#: Smallest rms error: a tenth of a bit of its converters.
 UNKNOWN, LEAST = 1e-2, 1e-6
-#: path of the voltage over which the error of a model changes, as a share of its range (taste:
-#: the misfit of H has a few waves over a stroke)
+#: path of the voltage over which the error of a model changes, as a share of its range (taste).
+#: The misfit of H has a few waves over a stroke.
 PATH = 0.25
-#: rms change of the offset in a second, in spans: 100 nm in a minute for a span of 100 um, a fast
-#: thermal drift
+#: rms change of the offset in a second, in spans.  A fast thermal drift of a span of 100 um is
+#: 100 nm in a minute.
 WALK = 1e-3 / np.sqrt(60.0)
 #: rms size of the offset, in spans, for an unchanged zero and for a zero anywhere (taste)
 ZEROS = (1e-3, 1.0)
-#: rms change of the gain in a second: d33 of PZT changes by some 0.1 % per kelvin, and a working
-#: stage warms by a kelvin in a minute
+#: rms change of the gain in a second.  d33 of PZT changes by some 0.1 % per kelvin, and a working
+#: stage warms by a kelvin in a minute.
 GAIN_WALK = 1e-3 / np.sqrt(60.0)
 #: rms change of the gain since identification (taste: some ten kelvin and lost poling)
 GAIN_SIZE = 0.1
@@ -83,8 +83,8 @@ DRIFT_TIME = 10.0
 DRIFT_SIZE = GAIN_SIZE / DRIFT_TIME
 #: refused measurements that make a step at least, and their largest spread over their mean (taste)
 STEADY, SPREAD = 10, 0.25
-#: largest and smallest slope of refused measurements over the free run that make a changed sign;
-#: a reading of the other sign has -2 (taste)
+#: least and largest slope of refused measurements over the free run for a changed sign (taste).  A
+#: reading of the other sign has the slope -2.
 MIRRORED = (-2.5, -1.5)
 #: rms size of d, as a share of the range of H: uniform, as earlier motion was anywhere in it
 BEYOND = 1.0 / np.sqrt(12.0)
@@ -106,15 +106,15 @@ class Observed:
     estimate, std : ndarray
         Displacement, and the standard deviation of its error.
     offset, offset_std : ndarray
-        Constant part of the correction, with the plays that have not moved since the start, and
-        its standard deviation.
+        Constant part of the correction, and its standard deviation.  Plays whose output is unknown
+        count as offset.
     creep, creep_std : ndarray
         Creep from earlier motion, and its standard deviation.
     gain, gain_std : ndarray
         Relative change of the gain, and its standard deviation; zero if it is not followed.
     drift, drift_std : ndarray
-        Change of the gain in a second, and its standard deviation: if the drift is not followed,
-        over the last `DRIFT_TIME`.
+        Change of the gain in a second, and its standard deviation; taken over the last
+        `DRIFT_TIME` if the drift is not followed.
     band : ndarray
         Largest further change of the offset by plays of unknown output.
     fading : ndarray, shape (c,)
@@ -137,7 +137,7 @@ class Observed:
 
 class Observer:
     """
-    Follows offset, creep and gain, which a free run lacks, by displacement from a horizon ago.
+    Estimates offset, creep and gain from displacement that is a horizon old.
 
     The result does not depend on the size of the blocks.
 
@@ -254,12 +254,12 @@ class Observer:
         return self._started and not self._is_lost and bool(self._bounds.known.all())
 
     def lose_memory(self) -> None:
-        """Note that voltage was lost before the next sample."""
+        """Note a gap in the voltage before the next sample: the plays are unknown again."""
         self._is_lost = True
 
     @property
     def doubt(self) -> str:
-        """Motion of the sensor that the stage hardly makes; empty if the sensor seems sound."""
+        """Motion of the reading that a stage hardly makes, as text; '' for a sound reading."""
         if not self._started:
             return ''
         now = self._state.now
