@@ -68,6 +68,7 @@ class Replay:
     progress: float = 0.0
     slipped: float = 0.0
     names: str = ''
+    is_over: bool = False
 
 
 class PlayerNode(LabNode):
@@ -123,7 +124,8 @@ class PlayerNode(LabNode):
         return 'stopping'
 
     def _is_replaying(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+        # the thread closes the bag after its last status
+        return self._replay is not None and not self._replay.is_over
 
     # the replay, in a thread of its own
 
@@ -141,14 +143,12 @@ class PlayerNode(LabNode):
                 schedule = self._send(replay, bag, senders, clock)
                 self._report_end(replay, bag, schedule, clock)
         except _Stopped:
-            self._report(
-                'stopped',
-                f'stopped after {replay.messages} of {replay.total} messages',
-                progress=replay.progress,
-            )
+            replay.is_over = True
+            about = f'stopped after {replay.messages} of {replay.total} messages'
+            self._report('stopped', about, OK, replay.progress)
         # the status has to report any failure of this thread
         except Exception as error:  # noqa: BLE001
-            replay.failure = self.reason(error)
+            replay.failure, replay.is_over = self.reason(error), True
             state = 'failed' if prepared else 'refused'
             self._report(state, replay.failure, ERROR, replay.progress)
 
@@ -256,6 +256,7 @@ class PlayerNode(LabNode):
         early = f'the bag ends early: {faults}' if faults else ''
         level = WARN if early else OK
         parts = [about, *map(str, clock.faults), early]
+        replay.is_over = True
         self._report('done', '; '.join(filter(None, parts)), level, 100.0)
 
     # reports

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph, in_time
+from piezo_ident.nodes.player import PlayerNode, Replay
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
 from piezo_ident.record.bags.write import BagWriter, SAMPLE_QOS
@@ -61,6 +62,32 @@ def same(got: list[Samples], want: list[Samples]) -> bool:
         and (a.segment, a.quantity) == (b.segment, b.quantity)
         for a, b in zip(got, want, strict=True)
     )
+
+
+@pytest.mark.parametrize('is_there', [True, False])
+def test_a_replay_may_be_started_again_from_its_last_status_on(tmp_path, is_there):
+    if is_there:
+        bag(tmp_path / 'bag')
+    states = []
+
+    class Player(PlayerNode):
+        """A player without ROS, whose replay is stopped before its first message."""
+
+        def __init__(self):
+            self._replay = Replay(str(tmp_path / 'bag'), ('voltage',))
+            self._replay.stop.set()
+            self.resolve_topic_name = '/{}'.format
+
+        def reason(self, error):
+            return str(error)
+
+        def report_status(self, state, *_, **__):
+            states.append((state, self._is_replaying()))
+
+    node = Player()
+    assert node._is_replaying()
+    node._work(node._replay)
+    assert states == [('stopped' if is_there else 'refused', False)]
 
 
 @pytest.fixture(scope='module')
