@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from piezo_ident.common.errors import ConfigError, PiezoIdentError
+from piezo_ident.common.errors import ConfigError
 from piezo_ident.live.guard import LAST_RAMP
 from piezo_ident.live.pacing import Pace
 from piezo_ident.live.tracker import Tracker
@@ -104,8 +104,8 @@ class DrivingNode(LabNode):
                 for output in self._outputs:
                     output.refuse_foreign_blocks()
                 self.work()
-        except PiezoIdentError as error:
-            self._halt('failed', str(error))
+        except Exception as error:  # noqa: BLE001  # any fault ends at rest
+            self._halt('failed', self.reason(error))
 
     def _send(self, t: NDArray[np.float64], v: NDArray[np.float64], segment: str) -> None:
         for k in range(0, t.size, BLOCK_SIZE * 10):

@@ -42,7 +42,7 @@ import time
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.errors import ConfigError, DataError, ModelError
+from piezo_ident.common.errors import ConfigError, DataError
 from piezo_ident.live.axis_drive import Drive, Successor
 from piezo_ident.live.follower import MOST
 from piezo_ident.live.guard import GuardSettings
@@ -238,8 +238,8 @@ class FeedforwardNode(DrivingNode):
             self._wanted.join.add(tail, samples, time.monotonic(), sequence)
             try:
                 self._take_complete()
-            except ModelError as error:  # modes that run away
-                self._halt('failed', str(error))
+            except Exception as error:  # noqa: BLE001  # as ModelError for modes that run away
+                self._halt('failed', self.reason(error))
             self._busy += time.perf_counter() - begin
         self.report_state()
 

@@ -11,10 +11,12 @@ from types import SimpleNamespace
 from course import block, column, FS, model_of, paper
 from graph import Graph, in_time
 import numpy as np
+from piezo_ident.common.errors import ModelError
 from piezo_ident.live.axis_drive import Successor
 from piezo_ident.model.files import model_to_yaml
 from piezo_ident.nodes import feedforward
 from piezo_ident.nodes.feedforward import FeedforwardNode
+from piezo_ident.nodes.wire import to_message
 import pytest
 from std_msgs.msg import Float64MultiArray
 
@@ -377,6 +379,24 @@ def test_a_stop_during_the_ramp_after_a_fault_keeps_its_reason():
     node._state, node._end = 'stopping', ('failed', 'somebody drives')
     assert node._stop() == 'ramping to 0 V'
     assert node._end == ('failed', 'somebody drives')
+
+
+@pytest.mark.parametrize('error', [ModelError('runs away'), ValueError('unforeseen')])
+def test_any_fault_of_a_block_or_of_the_timer_ends_in_a_ramp(monkeypatch, error):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(Idle, 'work', fails)
+    monkeypatch.setattr(Idle, '_take_complete', fails)
+    node, ends = Idle(), []
+    node._halt, node.reason = lambda *end: ends.append(end), str
+    node._state, node._outputs, node._model, node._busy = 'tracking', [], None, 0.0
+    node._on_timer()
+    node._wanted = SimpleNamespace(join=SimpleNamespace(add=lambda *_: None))
+    node.report_state = lambda: None
+    message = to_message(block(0, reference(0.01), 'scan', 'reference'))
+    node._on_reference('', message, {'publication_sequence_number': 1})
+    assert ends == [('failed', str(error))] * 2
 
 
 def test_another_silence_counts_in_the_present_stream():
