@@ -192,9 +192,11 @@ class ExcitationClient:
         self._looks.look()
         if self._phase:
             getattr(self, f'_{self._phase}')()
-        elif self.left is not None and self._plays and self._looks.is_over(self._sign, _AGAIN):
-            # the answer is lost, and the start was accepted
-            self._leave()
+        elif self.left is not None and self._plays and not self._silent():
+            # later a program may be of someone else: the answer alone counts
+            if self._looks.is_over(self._sign, _AGAIN):
+                # the answer is lost, and the start was accepted
+                self._leave()
 
     @property
     def _plays(self) -> bool:

@@ -171,6 +171,24 @@ def test_a_cancelled_start_whose_answer_is_lost_is_stopped_once(monkeypatch):
     assert stopper.calls == 1
 
 
+def test_a_program_long_after_a_lost_start_is_of_somebody_else(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
+    client, node = starting()
+    _, _, starter, stopper = node.clients
+    client.stop()
+    for state in ('idle', 'running'):
+        hear(client, state)
+        for _ in range(500):
+            clock[0] += 0.05
+            client.poll()
+        assert stopper.calls == 0
+    # the answer would still tell
+    (asked,) = starter.waited_for
+    asked.set_result(Trigger.Response(success=True))
+    assert stopper.calls == 1
+
+
 @pytest.mark.parametrize('is_new_accepted', [True, False])
 @pytest.mark.parametrize('answer', ['before', 'after', 'never'])
 def test_a_late_answer_to_an_earlier_start_stops_no_newer_run(is_new_accepted, answer):
