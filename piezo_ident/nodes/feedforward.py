@@ -160,7 +160,7 @@ class FeedforwardNode(DrivingNode):
             self._tracker = new
         elif self._tracker is not None:
             self._tracker.take_over(new)
-        self._source, self._refusal = source, ''
+        self._source, self._refusal, self._later = source, '', None
         self._models += 1
         if self._models > 1:
             self.journal.tell(f'{self._state}: model {self._models} is taken over, {source}')

@@ -399,6 +399,16 @@ def test_any_fault_of_a_block_or_of_the_timer_ends_in_a_ramp(monkeypatch, error)
     assert ends == [('failed', str(error))] * 2
 
 
+def test_a_model_of_several_axes_that_waits_does_not_replace_a_newer_one():
+    node = Idle()
+    node._tails, node._later, node._state = ['', '_b'], None, 'tracking'
+    node._take_model(('older', node.tracker()), 'older.yaml')
+    assert node._later is not None and node._model == 'old'
+    node._state = 'done'
+    node._take_model(('newer', node.tracker()), 'newer.yaml')
+    assert node._later is None and (node._model, node._source) == ('newer', 'newer.yaml')
+
+
 def test_another_silence_counts_in_the_present_stream():
     node = Idle()
     node._sample_clock = SimpleNamespace(longest_gap=SILENCE)
