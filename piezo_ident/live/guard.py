@@ -201,8 +201,9 @@ class Guard:
 
     @settings.setter
     def settings(self, settings: GuardSettings) -> None:
-        self._settings = settings
-        self._ramp = None
+        # equal settings do not begin a ramp anew
+        if settings != self._settings:
+            self._settings, self._ramp = settings, None
 
     @property
     def applied(self) -> float:

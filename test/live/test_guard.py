@@ -3,6 +3,7 @@
 
 """The safety contract: the voltage applied never leaves limits nor slew, whatever happens."""
 
+from dataclasses import replace
 import math
 
 from hypothesis import given, settings
@@ -203,3 +204,11 @@ def test_silence_is_remembered_when_limits_are_moved_in_it():
     before = guard.applied
     # what comes next is a new stream all the same, and joined by a ramp
     assert guard.process([before - 0.9]).altered == {'joining': 1}
+
+
+def test_equal_settings_do_not_begin_a_ramp_anew():
+    guard, whole = Guard(USUAL, 7.3), Guard(USUAL, 7.3)
+    first = guard.idle(100)
+    guard.settings = replace(USUAL)
+    got = np.concatenate([first, guard.idle(300)])
+    assert got.tobytes() == whole.idle(400).tobytes()
