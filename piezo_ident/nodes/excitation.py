@@ -7,7 +7,8 @@ Excitation node: plays programs on `voltage`, or on `reference` for the feedforw
 ``~/start`` builds the program of the parameter `program`, waits for `subscribers`, and sends block
 after block from a thread.  The clock of the samples starts at zero with every program.  A block is
 sent when its first sample is due on this clock, which runs `rate_factor` times as fast as real
-time.  A late listener does not hold up the node; each listener reports its losses.
+time.  Another `rate_factor` or `block_size` counts from the next start on.  A late listener does
+not hold up the node; each listener reports its losses.
 
 ``~/stop`` ramps from the last voltage to rest with `ramp_slew`, as segment ``ramp:stop``.  SIGINT
 and SIGTERM end in a ramp of at most a second, if necessary steeper than `ramp_slew`.  Ramps run in
