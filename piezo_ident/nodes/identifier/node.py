@@ -181,8 +181,8 @@ class IdentifierNode(LabNode):
             return
         try:
             self._identify('all')
-        except PiezoIdentError as error:
-            self.fail(str(error))
+        except Exception as error:  # noqa: BLE001  # the status must tell the end
+            self.fail(self.reason(error))
 
     def _identify(self, which: str) -> str:
         self._refuse_when_busy()
@@ -306,7 +306,10 @@ class IdentifierNode(LabNode):
     def _take_outcomes(self) -> None:
         while self._outcomes:
             self._worker.join(1.0)
-            self._outcomes.popleft()()
+            try:
+                self._outcomes.popleft()()
+            except Exception as error:  # noqa: BLE001  # the status must tell the end
+                self.fail(self.reason(error))
 
     def _conclude(self, result: Result | None, error: Exception | None) -> None:
         if error is not None:

@@ -3,6 +3,7 @@
 
 """The identifier as a process: what it captures, refuses, identifies, cancels and writes."""
 
+from collections import deque
 import json
 import os
 from pathlib import Path
@@ -30,6 +31,19 @@ def record():
 def blocks(record):
     """(voltage, displacement) of each block."""
     return pairs_of(record)
+
+
+def test_the_status_tells_the_end_of_work_after_any_fault(monkeypatch):
+    def fails(*_):
+        raise ValueError('unforeseen')
+
+    node, told = IdentifierNode.__new__(IdentifierNode), []
+    node.fail, node.reason = told.append, str
+    node._worker, node._outcomes = SimpleNamespace(join=lambda _: True), deque([fails])
+    node._take_outcomes()
+    monkeypatch.setattr(IdentifierNode, '_identify', fails)
+    node._run_ended(None)
+    assert told == ['unforeseen'] * 2 and not node._outcomes
 
 
 @pytest.fixture(scope='module')
