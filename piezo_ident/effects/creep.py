@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Creep: domains keep turning after the voltage has stopped."""
+"""Creep of a piezo ceramic: slow first-order elements in parallel with H, in units of H."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from piezo_ident.operators.chain import Block
 AT_ONCE = 0.05
 #: largest creep against the direction of a step, as a share of the creep along it
 BACK = 0.5
-#: prior rms of a share.  Neighbouring elements hardly differ: large shares of opposite sign could
-#: cancel each other in data of a few seconds, but not in other data
+#: prior rms of c_i.  Neighbouring elements hardly differ: large c_i of opposite sign could cancel
+#: each other in data of a few seconds, but not in other data
 SPREAD = 0.02
 
 
 @kernel
-def _crept(h: Array, c: Array, share: Array, state: Array) -> Array:
-    # share: 1 - a_i; the update is a difference, so that an element at its input rests exactly
+def _crept(h: Array, c: Array, rate: Array, state: Array) -> Array:
+    # rate: 1 - a_i; the update is a difference, so that an element at its input rests exactly
     out = np.empty(h.size)
     for k in range(h.size):
         x = h[k]
         w = 0.0
         for i in range(c.size):
             s = state[i]
-            s = alive(s + share[i] * (x - s))
+            s = alive(s + rate[i] * (x - s))
             state[i] = s
             w += c[i] * s
         out[k] = x + w
@@ -84,16 +84,16 @@ class Creep(Effect):
     )
 
     def prepare(self) -> None:
-        """Drop elements without a share."""
+        """Drop elements with c_i = 0."""
         self._active = np.flatnonzero(self.array('gain'))
         self._c = self.array('gain')[self._active]
         times = self.array('time_constant')[self._active]
-        self._share = -np.expm1(-1.0 / (self.sample_rate * times))
+        self._rate = -np.expm1(-1.0 / (self.sample_rate * times))
         self._distance = np.zeros(self._c.size)
 
     def start_from(self, beyond: Array) -> None:
         """
-        Set the distance of each element from its rest after a reset: shape (c,), empty at rest.
+        Set ``x_i - h`` of each element after a reset, normalised; empty for elements at rest.
 
         Raises ModelError if the number of distances is not the number of elements.
         """
@@ -106,7 +106,7 @@ class Creep(Effect):
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:
-        """List elements spread over all times of the data, in two densities."""
+        """List two sets of elements, seven and four, spread over all times of the data."""
         # faster elements would imitate the dynamics, or a gain of H if the data are slow
         shortest = max(5.0 / view.sample_rate, 0.01 if view.is_fast else AT_ONCE)
         # a time constant far beyond the judged data would imitate a drift
@@ -118,10 +118,10 @@ class Creep(Effect):
     @classmethod
     def is_plausible(cls, values: Mapping[str, Any]) -> bool:
         """
-        Tell whether the creep after a step continues in the direction of the step.
+        Tell whether the creep after a step mainly continues in the direction of the step.
 
-        Shares of neighbouring time constants compensate each other, so a single share may be
-        negative.  The fastest elements may correct the dynamics and do not count.
+        A single c_i may be negative, as neighbouring elements compensate each other.  The first
+        `AT_ONCE` after the step does not count, as fast elements may correct the dynamics.
         """
         gain, tau = (np.asarray(values[name], np.float64) for name in ('gain', 'time_constant'))
         t = np.geomspace(min(AT_ONCE, tau.max()), tau.max(), 100)
@@ -138,12 +138,12 @@ class Creep(Effect):
         if self._c.size == 0:
             return block
         x = np.ascontiguousarray(block.x)
-        return block.with_signal(_crept(x, self._c, self._share, self._state))
+        return block.with_signal(_crept(x, self._c, self._rate, self._state))
 
     def c_code(self) -> CCode:
         """Write the effect in C."""
         n = self._c.size
         if n == 0:
             return CCode()
-        numbers: Numbers = {'n': n, 'gain': self._c, 'share': self._share}
+        numbers: Numbers = {'n': n, 'gain': self._c, 'share': self._rate}
         return read_c(__package__, 'creep', {**numbers, 'rest': 1.0 + self._c.sum()})

@@ -16,9 +16,9 @@ functions: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, secti
 doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are not a Preisach operator.
 All of these terms have the play outputs as their memory.
 
-A semilinear Duhem model forgets along the path of the voltage, at any speed.  It has no return
-point memory: ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)`` and cubic phi_j.
-J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
+A semilinear Duhem model adds ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)``
+and cubic phi_j.  A lag z_j decays along the path of v, at any speed, and has no return point
+memory.  J. Oh and D. S. Bernstein, "Semilinear Duhem model for rate-independent and
 rate-dependent hysteresis", IEEE Trans. Automatic Control 50(5), 2005,
 doi:10.1109/TAC.2005.847035; Bouc-Wen and Coleman-Hodgdon loops are of this kind.
 """
@@ -209,7 +209,7 @@ class Hysteresis:
 
     def slopes(self, sweeps: bool) -> tuple[Array, Array]:
         """
-        Compute voltages over the span, and the slope of H behind a turn at each; shapes (k,).
+        Compute voltages over the span, and dw/dv right after a turn at each; shapes (k,).
 
         `sweeps` adds slopes between any two of nine voltages: lags along the path need them.
         """
@@ -225,9 +225,9 @@ class Hysteresis:
 
     def slope_at_turns(self, v: Array) -> Array:
         """
-        Bound dw/dv from below behind a turn of the voltage, where plays stand; shapes (n,).
+        Bound dw/dv from below right after a turn of the voltage, where plays stand; shapes (n,).
 
-        Plays that are lines move even there.  Lags along the path count as at rest.
+        Plays that are lines move even there.  The lags z_j count as constant.
         """
         slope = self.p2 + (2.0 * self.p0 + 3.0 * self.p1 * v) * v
         low, high = self.span

@@ -13,8 +13,8 @@ Families (laws) of H that are linear in their coefficients, for fixed thresholds
 
 hat_j are piecewise linear functions of the threshold on a few even nodes.  All coefficients are >=
 0, except for lags and powers of v.  Every play therefore keeps a weight >= 0 wherever it stands.
-`preisach` is a Preisach operator with a density that is smooth along the bias and free along the
-threshold: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
+`preisach` is a Preisach operator.  Its density is q_i plus cubic polynomials in the play output:
+Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
 doi:10.1007/978-1-4612-4048-8.
 """
 
@@ -90,22 +90,22 @@ class HysteresisLaw:
 
     def roughness(self, density: float, change: float) -> Array:
         """
-        Compute rows whose products with the coefficients measure how rough H is; shape (k, size).
+        Compute the rows of a penalty on the roughness of H, dimensionless; shape (k, size).
 
-        A product is one for a play of the density `density`, for a density `change` that depends
-        on the play output, and for a step `change` between two coefficients of one polynomial.
+        The rows divide q_i by `density` times the gap below r_i.  They divide other densities, and
+        differences between neighbouring coefficients of one polynomial, by `change`.
         """
         m, n = self.thresholds.size, self.densities
-        size = np.eye(n, self.size) / change
+        sizes = np.eye(n, self.size) / change
         gaps = np.maximum(np.diff(self.thresholds, prepend=0.0), 1e-12)
-        size[:m] *= (change / density / gaps)[:, None]
+        sizes[:m] *= (change / density / gaps)[:, None]
         width = 2 if self.name == 'bias' else DEGREE + 1
         differences = [
             (np.eye(self.size)[j + 1] - np.eye(self.size)[j]) / change
             for j in range(m, n - 1)
             if (j - m) % width < width - 1
         ]
-        return np.vstack([size, *differences])
+        return np.vstack([sizes, *differences])
 
     @functools.cached_property
     def _parameters(self) -> Array:
