@@ -25,7 +25,7 @@ from piezo_ident.record.record import Record
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 
-#: smallest shift of small motion that counts as drift, relative to the rms error on the triangles
+#: smallest difference of the mean errors in `moves_on`, over the rms error on the triangles
 ELSEWHERE = 2.0
 
 
@@ -198,7 +198,7 @@ def _residual(model: StageModel, run: Run) -> Array:
 
 def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     """
-    Tell whether small motion has another mean level than the triangles predict.
+    Tell whether the mean errors of small motion and of triangles differ clearly.
 
     If a stage is not a sum of plays, its small loops stay open: under steps and noise the
     displacement drifts towards the middle of the large loop.  A triangle hides this drift.

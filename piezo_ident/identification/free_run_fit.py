@@ -4,9 +4,9 @@
 """
 Identify records without labelled segments: fit delay, dynamics and hysteresis together.
 
-A search on at most `MOST` samples fits many candidates and chooses one.  The chosen candidate is
-then fitted to all samples that are not held out, and the held-out samples judge this fit.  The
-final model is fitted to all samples.  `make any-record` compares it with other programs.
+About a fifth of each record is held out.  `free_run_starts` fits candidates to at most `MOST` of
+the other samples, and `selection.comparison` chooses one.  This candidate is fitted to all samples
+that are not held out, and the held-out samples judge this fit.  A last fit has all samples.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 #: windows of at most `WINDOWED` samples together, and then lasts half a minute.  The final fits
 #: have about `MOST_ROWS` rows at most
 MOST, WINDOWED, MOST_ROWS = 100_000, 60_000, 400_000
-#: number of blocks of all stretches together (taste: a fifth of the blocks is held out in turn)
+#: number of blocks of all stretches together (taste); the search holds out a fifth of them in turn
 BLOCKS = 50
 #: number of plays of H, including the play at r = 0, unless the user sets it
 PLAYS = 40

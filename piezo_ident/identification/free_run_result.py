@@ -204,7 +204,7 @@ def _missing(fits: FreeRunFits, delay: DelayResult, rate: float, band: float) ->
 
 
 def _warn_of_creep(fits: FreeRunFits) -> list[str]:
-    """Warn if creep lowers the error, but by less than an effect must."""
+    """Warn if creep lowers the error clearly, but not to `selection.comparison.EFFECT`."""
     more = shown_effect(fits.candidates, fits.best)
     if more is None:
         return []

@@ -5,9 +5,9 @@
 Search for H, G and the delay by free-run fits from several starts.
 
 The starts are H alone, G from the voltage with a straight line for H, and G from the output of H.
-Least squares (ARX) gives each G at several orders and delays.  The free-run fit then varies H, G
-and the memory at the start together.  One comparison on held-out samples judges all fits, so the
-result predicts these samples as well as the best start.
+Least squares (ARX) gives each G at several orders and delays.  A free-run fit from each start
+varies H, G and the memory at the start together.  `selection.comparison` chooses one fit.  From
+this fit, creep and wider laws of H are tried, and the comparison chooses among all fits again.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from scipy.signal import butter, sosfilt
 ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
 #: laws of H that are tried besides sums of plays
 WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
-#: voltages at which their densities end, normalised: they are smooth at the ends of the range
+#: span of these laws, normalised: it exceeds the range, so their densities are smooth at its ends
 WIDE = (-0.15, 1.15)
 #: first guess of an unknown memory at a start: all shares in the middle
 UNKNOWN = 0.5
@@ -167,15 +167,15 @@ class Search:
         """
         Find the best candidate, and list all candidates.
 
-        A start at rest has a known memory.  The search also tries to fit this memory.  All starts
-        count as unknown if the fitted memory lowers the error by as much as an effect must.
+        A start at rest has a known memory.  The search also fits this memory.  All starts count as
+        unknown if the fitted memory lowers the mean square to `selection.comparison.EFFECT`.
         """
         alone = self._hysteresis_alone()
-        if self._starts_otherwise(self._candidate('hysteresis', alone)):
+        if self._needs_fitted_starts(self._candidate('hysteresis', alone)):
             return self._unknown_starts.best()
         candidates = self._orders(alone)
         best = best_of(candidates)
-        if self._starts_otherwise(best):
+        if self._needs_fitted_starts(best):
             return self._unknown_starts.best()
         return best, tuple(candidates)
 
@@ -183,7 +183,7 @@ class Search:
     def _unknown_starts(self) -> Search:
         return replace(self, guesses=np.where(self.guesses > 0.0, self.guesses, UNKNOWN))
 
-    def _starts_otherwise(self, one: Candidate) -> bool:
+    def _needs_fitted_starts(self, one: Candidate) -> bool:
         """Tell whether a fitted memory at the starts at rest lowers the error enough."""
         if self.guesses.any(axis=1).all():
             return False
@@ -227,7 +227,7 @@ class Search:
                 f'order: least squares finds no stable G of order {self.allowed.order} in the '
                 'fitted parts; record longer, or give another order (--order) or none'
             )
-        return candidates + self._later(best_of(candidates))
+        return candidates + self._with_longer_delays(best_of(candidates))
 
     def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
         """Fit candidates with creep, with wider laws of H, and with both."""
@@ -247,7 +247,7 @@ class Search:
         return self._candidate(f'{best.name}, {name}', self._fit(stage, MANY), effects)
 
     def _crept_before(self, creeping: Sequence[Candidate]) -> list[Candidate]:
-        """Add creep of earlier motion to the best candidate with creep, if it errs less."""
+        """Add creep of earlier motion to the best candidate with creep, if the error falls."""
         known = min(creeping, key=lambda c: c.error)
         if not known.fit.stage.resting.any():
             return []
@@ -258,7 +258,7 @@ class Search:
         return [free] if ALIKE * free.error < known.error else []
 
     def _crept(self, stage: Stage, taus: Array) -> Stage:
-        """Add creep to a stage; remove a slow pole and its zero from G if creep replaces them."""
+        """Add creep to a stage; remove the slow poles of G if creep may have their gain."""
         crept, G = stage.with_creep(taus, self.stretches), stage.dynamics
         faster = G.without_slow_poles(1.0 / (2.0 * np.pi * taus[0]), self.stretches[0].rate)
         share = abs(G.gain / faster.gain - 1.0)
@@ -266,8 +266,8 @@ class Search:
             return crept
         return replace(crept, dynamics=faster.normalised())
 
-    def _later(self, best: Candidate) -> list[Candidate]:
-        """Replace the first coefficient of B by a sample of delay, while the error falls."""
+    def _with_longer_delays(self, best: Candidate) -> list[Candidate]:
+        """Replace the first coefficient of B by a sample of delay, while `best_of` prefers it."""
         accepted: list[Candidate] = []
         one = best
         while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:

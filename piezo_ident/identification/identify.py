@@ -70,7 +70,7 @@ def identify_and_judge(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> tuple[Identification, Judged]:
-    """Identify a stage of one axis; also return the base of promise, band and deviations."""
+    """Identify a stage of one axis; also return the runs for promise, band and deviations."""
     records, validation = (records_of(x, 'identify') for x in (records, validation))
     settings = Settings() if settings is None else settings
     hint = 'make them with Settings(...), and give several records as one list'

@@ -27,7 +27,7 @@ from piezo_ident.record.record import Piece, Record
 BLOCKS, EVERY = 60, 5
 #: share at the end of every noise and step segment that is not fitted
 END_HELD = 0.2
-#: a record starts with a known memory if its voltage starts within this share of the lowest
+#: a start has a known memory if its voltage is within this share of the range from the lowest
 REST = 0.01
 #: share of its range by which the voltage of a run must move
 MOVES = 0.02
@@ -274,7 +274,7 @@ def scaling_of(pieces: Sequence[Piece]) -> Scaling:
 
 def _correlation(piece: Piece) -> float:
     """
-    Correlate averages of voltage and displacement, over the averaging time that correlates most.
+    Correlate averages of voltage and displacement, over the averaging time of best correlation.
 
     Above a resonance a stage moves against its voltage, so fast motion does not tell the sign.
     The correlation of n averages by chance, 1 / sqrt(n), is subtracted.

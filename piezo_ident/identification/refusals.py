@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Refuse records without a response to the voltage: undriven, or under position control."""
+"""Refuse records whose displacement ignores the voltage, and records under position control."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def refuse_undriven(records: Sequence[Record]) -> None:
 
     Either of two proofs accepts the records.  First, the spectra of voltage and displacement are
     more coherent at some frequency than by chance (1e-7).  For Gaussian noise the chance of a
-    coherence c over L segments is ``1 - c`` raised to ``L - 1``, for any displacement.  A line is
-    taken out of each segment.  The line is kept only if the voltage moves by far more than its
-    noise, because two drifts agree by chance.  Second, a model with the voltage predicts parts of
-    the record better than any model without it.  A single loop of strong hysteresis needs this
-    proof, as its coherence is low.
+    coherence c over L segments is ``1 - c`` raised to ``L - 1``, for any displacement.  Each
+    segment is detrended, because two drifts agree by chance.  Segments with their trends count,
+    too, if the voltage moves by far more than its noise.  Second, a model with the voltage errs by
+    `BETTER` less on predicted parts of a record than all models without it.  A single loop of
+    strong hysteresis needs this proof, as its coherence is low.
     """
     pieces = [piece for record in records for piece in record if np.ptp(piece.v) > 0.0]
     if any(piece.n < MIN_COHERENCE for piece in pieces):
@@ -96,8 +96,8 @@ def held_out_errors(piece: Piece) -> tuple[float, float]:
     resting = [one, line, np.vander(t, 4), *(np.column_stack([one, x]) for x in drifts)]
     driven = [np.hstack([base, x]) for base in (one, line) for x in (powers, loops)]
     stroke = float(np.ptp(piece.y))
-    best, rival = (min(_left_of_parts(A, y) for A in columns) for columns in (driven, resting))
-    return 100.0 * best / stroke, 100.0 * rival / stroke
+    with_v, without_v = (min(_left_of_parts(A, y) for A in sets) for sets in (driven, resting))
+    return 100.0 * with_v / stroke, 100.0 * without_v / stroke
 
 
 def _left_of_parts(A: Array, y: Array) -> float:
@@ -151,9 +151,9 @@ def refuse_closed_loop(record: Record) -> None:
     """
     Refuse a record under position control, where the voltage answers the position.
 
-    Position control has two signs.  The drive moves while the position is held, or the position
-    follows a straight line more closely than the drive.  Voltage control shows the opposite: the
-    stage creeps, and its hysteresis bends the displacement, not the voltage.
+    Either observation shows position control: the drive moves while the position is held, or the
+    position follows a straight line more closely than the drive.  Under voltage control the stage
+    creeps, and its hysteresis bends the displacement, not the voltage.
     """
     span, stroke = float(np.ptp(record.voltage_range)), record.stroke
     if span == 0.0 or stroke == 0.0:

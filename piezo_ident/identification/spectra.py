@@ -23,7 +23,7 @@ SEGMENT = 8192
 TRUSTED = 0.1
 #: corner below which the slow part of a signal is removed [Hz]
 HIGH_PASS = 30.0
-#: averaging time of the size of fast motion [s]
+#: averaging time of a running rms [s]
 WINDOW = 0.1
 #: smallest number of points of a response: fewer points come from a few sines
 POINTS = 20
@@ -134,7 +134,7 @@ def _response(
 
 
 def highest_frequency(u: Array, rate: float) -> float:
-    """Find the frequency [Hz] below which all but a millionth of the moving power lies."""
+    """Find the frequency [Hz] below which all but a millionth of the power of changing u lies."""
     du = np.diff(u)
     if du.size == 0:
         return 0.0
@@ -160,7 +160,7 @@ def high_passed(x: Array, rate: float) -> Array:
 
 
 def rms_above(u: Array, rate: float, edge: float) -> Array:
-    """Compute the rms above a frequency around each sample, shape (n,)."""
+    """Compute the running rms of the part of u above the frequency `edge` [Hz], shape (n,)."""
     if 4.0 * edge > rate:
         return np.zeros(u.size)
     width = max(1, int(WINDOW * rate))

@@ -4,10 +4,10 @@
 """
 Fit the unknown memory of labelled runs that do not start at the lowest voltage.
 
-Until the voltage has moved by the width of a play, the play may stand still at an unknown place.
-A free-run fit finds the places together with the plays, so the whole run can be fitted.  The fit
-uses only the extremes of the slow motion, because they alone move the plays.  The fit begins at
-several guesses, because a wrong guess leads to a wrong memory.
+A play may stand still at an unknown output until the voltage has moved by its threshold.  A
+free-run fit varies the outputs at the start and the weights together.  A run is thinned to the
+extremes and the last sample of each block, because extremes alone decide the play outputs; the
+displacement counts at the last samples.  The fit begins at several guesses and keeps the best.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PLAYS, FIT_BLOCKS = 40, 50
 FINER = 2
 #: shares m of plays that a rise before the start has pushed up, and that a fall has pushed down
 ENDS = (0.9, 0.1)
-#: iterations from every guess, from the best guesses, and number of best guesses
+#: iterations from every guess, iterations from the best guesses, and number of best guesses
 FEW, MANY, BEST = 3, 15, 1
 #: share by which another guess must err less than the plain guess to be chosen: a record of steps
 #: alone tells little about the memory
@@ -53,7 +53,7 @@ def _guesses() -> Array:
 
 
 def _thinned(excerpts: Sequence[Excerpt], lag: float, count: int) -> list[Stretch]:
-    """Thin runs to the extremes of `count` blocks, with the displacement `lag` samples later."""
+    """Thin runs to extremes and last samples of `count` blocks; the displacement lags by `lag`."""
     stretches = []
     for i, excerpt in enumerate(excerpts):
         u, n = excerpt.u, excerpt.u.size
@@ -101,19 +101,19 @@ def fit_starts(
     rough = _thinned(excerpts, lag, ROUGH)
     rough = rough if all(s.use.any() for s in rough) else stretches
 
-    def begun(shares: Array) -> Fit:
+    def rough_fit(shares: Array) -> Fit:
         guesses = np.zeros((len(excerpts), PARTS))
         guesses[sought] = shares
         return fit(Stage.linear(law, Dynamics.unit(), 0, guesses), rough, iterations=FEW)
 
-    def fitted(one: Fit) -> Fit:
+    def full_fit(one: Fit) -> Fit:
         starts, guesses = (np.repeat(x, FINER, 1) for x in (one.stage.starts, one.stage.guesses))
         finer = replace(one.stage, starts=starts, guesses=guesses)
         return fit(finer, stretches, iterations=MANY)
 
-    plain, *others = map(begun, _guesses())
+    plain, *others = map(rough_fit, _guesses())
     best = [plain, *sorted(others, key=lambda one: one.loss)[:BEST]]
-    plain, *others = map(fitted, best)
+    plain, *others = map(full_fit, best)
     chosen = min(others, key=lambda one: one.loss)
     stage = (chosen if chosen.loss < (1.0 - CLEARLY) * plain.loss else plain).stage
     for i in sought:

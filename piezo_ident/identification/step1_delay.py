@@ -5,9 +5,9 @@
 Step 1: find the pure delay from steps, and check it by a scan of the ARX loss.
 
 The step responses are divided by the signed height of their steps and averaged.  The delay is the
-first sample at which the average leaves the noise.  The scan fits ARX models with every delay to
-the steps or the noise.  Its delay is the largest delay before the loss rises.  If the delays of
-steps and scan differ, a free run over the noise decides.
+first of two samples at which the average exceeds five standard deviations of its noise.  The scan
+fits ARX models with each delay to the steps, else to the noise, and takes the largest delay of
+about the least loss.  If steps and scan differ, or the scan fails, free runs over noise decide.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ EQUAL = 0.02
 #: number of delays [samples] that the scan tries, and the orders na = nb of its models
 MAX_DELAY, SCAN_ORDER = 30, 8
 
-#: orders (n, n) that are tried, and delays [samples] that are tried below the delays in question
+#: orders (n, n) that are tried, and delays [samples] that are tried below the proposed delays
 CHECK_ORDERS = (4, 8, 12)
 CHECK_DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
 #: errors within this share of the smallest error count as equal to it
@@ -266,9 +266,9 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
     """
     # a result without source holds only the largest delay of the scan
     told = result.samples if result.source != 'none' else None
-    asked = [d for d in (told, result.scan) if d is not None]
-    most = max(asked, default=result.samples)
-    tried = sorted({*asked, most, *(d for d in CHECK_DELAYS if d < most)})
+    proposed = [d for d in (told, result.scan) if d is not None]
+    most = max(proposed, default=result.samples)
+    tried = sorted({*proposed, most, *(d for d in CHECK_DELAYS if d < most)})
     u, y = fitted
     factor = arx_factor(u, y, max(CHECK_ORDERS), max(CHECK_ORDERS) + tried[-1])
     # judge behind the fitted noise, so that long ringing has died away
@@ -283,7 +283,7 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
     if told is None and most in hold and (0 not in hold or least > FOLLOWS * held[1].std()):
         # the true delay may be larger, or the models do not follow the noise
         return result
-    samples = min((d for d in asked if d in hold), default=hold[-1] // 2)
+    samples = min((d for d in proposed if d in hold), default=hold[-1] // 2)
     if samples == told:
         return result
     if samples == result.scan:
@@ -295,10 +295,10 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
 
 def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> DelayResult:
     """
-    Find the delay from the steps; without steps, find it by a scan of the ARX loss over the noise.
+    Find the delay from the steps; if the steps do not tell it, find it by a scan of the ARX loss.
 
-    A free run over the noise decides if steps and scan differ, or if the scan fails.  Raises
-    IdentificationError if no method tells the delay.
+    Free runs over the noise decide if steps and scan differ by more than a sample, or if the scan
+    fails.  Raises IdentificationError if no method tells the delay.
     """
     progress('delay', 0.0)
     if settings.delay is not None:

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Step 2: find G from noise, for every order, free of hysteresis.
+Step 2: find G from noise, with the hysteresis undone.
 
-Under small noise the slope of H is not constant: the noise drags the plays along, and a linear fit
-takes their motion for slow dynamics.  G is therefore found twice.  After a first G, a temporary H
-with fine thresholds is fitted to the triangle.  Its output w = H[v] replaces the voltage of the
-noise segment, and G is found again from w to y.
+Noise moves the plays, and a linear fit takes their motion for slow dynamics.  G is therefore found
+twice.  After a first G, a temporary H with fine thresholds is fitted to the triangle.  Its output
+w = H[v] replaces the voltage.  The orders are ranked by the held-out free-run error from w to y.
+The best few are refined on noise and steps, and their held-out error chooses, without slow poles.
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ def without_slow_part(G: Dynamics, rate: float) -> Dynamics | None:
     """Remove the slow real poles of G, with G(1) = 1; None if a slow pole cannot be removed."""
     slowest = min(SLOW_POLE, SLOW_POLE_SHARE * rate)
     poles = G.poles
-    size = -np.log(np.maximum(np.abs(poles), 1e-300)) * rate / (2.0 * np.pi)
-    slow = np.hypot(size, np.angle(poles) * rate / (2.0 * np.pi)) < slowest
+    decay = -np.log(np.maximum(np.abs(poles), 1e-300)) * rate / (2.0 * np.pi)
+    slow = np.hypot(decay, np.angle(poles) * rate / (2.0 * np.pi)) < slowest
     if not slow.any():
         return G.normalised()
     if np.any(poles[slow].imag != 0.0):
@@ -148,8 +148,8 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     highest = BELOW_MODES * min(rings, default=0.0)
     poles, zeros = (np.asarray(roots, dtype=complex) for roots in (G.poles, np.roots(G.b)))
     for pole in sorted(poles[_decaying(poles, 0.0, highest, rate)], key=abs, reverse=True):
-        size = float(_size(pole, rate))
-        near = np.flatnonzero(_decaying(zeros, size / PAIR, size * PAIR, rate))
+        frequency = float(_frequency(pole, rate))
+        near = np.flatnonzero(_decaying(zeros, frequency / PAIR, frequency * PAIR, rate))
         # a conjugate pair of poles goes with a conjugate pair of zeros
         count = 1 if pole.imag == 0.0 else 2
         chosen = near[np.argsort(np.abs(zeros[near] - pole))][:count]
@@ -163,17 +163,17 @@ def without_pairs(G: Dynamics, rate: float) -> Dynamics:
     return Dynamics(a[1:], b * G.gain * a.sum() / b.sum())
 
 
-def _size(roots: ArrayLike, rate: float) -> Array:
+def _frequency(roots: ArrayLike, rate: float) -> Array:
     """Compute the natural frequencies of roots [Hz]."""
     z = np.asarray(roots, dtype=complex)
     return np.asarray(np.abs(np.log(np.where(z == 0.0, 1e-300, z))) * rate / (2.0 * np.pi))
 
 
 def _decaying(roots: NDArray[np.complex128], low: float, high: float, rate: float) -> Mask:
-    """Mark the roots that do not ring, with frequencies between two limits [Hz]."""
-    size = _size(roots, rate)
+    """Mark roots with damping above `RINGS` and frequencies between two limits [Hz]."""
+    frequency = _frequency(roots, rate)
     decay = -np.log(np.maximum(np.abs(roots), 1e-300)) * rate / (2.0 * np.pi)
-    return np.asarray((size > low) & (size < high) & (decay > RINGS * size))
+    return np.asarray((frequency > low) & (frequency < high) & (decay > RINGS * frequency))
 
 
 def _orders(
@@ -287,7 +287,7 @@ def second_step(
     slope_measured, slope_model = float(g_u @ x / (g_u @ g_u)), float(g_u @ g_w / (g_u @ g_u))
     response = frequency_response(run.u[start:stop], run.x[start:stop], rate, result.band)
     progress('dynamics', 1.0)
-    found_last = replace(
+    complete = replace(
         result,
         covariance=fit.normalised_covariance,
         response=response,
@@ -295,7 +295,7 @@ def second_step(
         slope_measured=slope_measured,
         slope_model=slope_model,
     )
-    return found_last, G
+    return complete, G
 
 
 def _best_in_free_run(

@@ -4,10 +4,10 @@
 """
 Step 3: choose the law of H and its thresholds by data that were not fitted.
 
-The record is cut into a few long parts, so that each part holds other sweeps, steps or noise.
-Each part is predicted from all other parts.  The plain sum of plays stays unless a wider law has a
-clearly smaller error on the predicted parts.  The error of the fit itself would mislead: on loops
-that no law describes, a wider law fits slightly better and predicts worse.
+The data are cut into eight parts, and each part is predicted from all other parts.  A wider
+law must lower the geometric mean of their rms errors by `WORTH`, even with one standard error
+added, and is then checked on small motion.  Else H stays a sum of plays, and its thresholds become
+finer while held-out blocks err less.  The error of the fit itself would prefer too wide laws.
 """
 
 from __future__ import annotations
@@ -98,10 +98,10 @@ def choose_thresholds(
     tick: Callable[[float], None] = lambda share: None,
 ) -> Array:
     """
-    Refine the thresholds until the held-out error stops falling.
+    Refine the thresholds until two larger grids in a row lower the held-out error too little.
 
-    The grid grows.  At each size the plays without weight are dropped and neighbours are merged.
-    The merged thresholds compete with the grid by their held-out error, to which each threshold
+    At each size of the grid, plays without weight are dropped and neighbours are merged.  The
+    merged thresholds compete with the grid by their held-out error, to which each threshold
     adds 0.1 %.  `fit` and `held` are the same runs in the same order with the fitted and the
     held-out samples.  `swing` is the excited range of the normalised voltage.  `tick` is called
     with the share of the work done, and may raise to stop it.
@@ -166,7 +166,7 @@ class Means(Excerpt):
 @dataclass(frozen=True, eq=False)
 class Choice:
     """
-    Choice of a law for H; None if the plain sum of plays stays.
+    Choice of a law for H; the law is None if the plain sum of plays stays.
 
     Each part of the data is predicted from all other parts.  `errors` holds, for each tried law,
     the geometric mean of the rms errors of the parts, normalised.
@@ -186,9 +186,9 @@ def choose_law(
     """
     Choose the law of H by parts of the data that are predicted from all others.
 
-    `others` is small motion.  On small motion a wider law must err about as little as plays.  A
-    law with lags must err clearly less than plays, because under a triangle of one speed creep
-    looks like a lag along the path.
+    `others` is small motion, on which a wider law must err at most `NO_WORSE` times as much as
+    plays.  A law with lags must err by `WORTH` less than plays, because under a triangle of one
+    speed creep looks like a lag along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
     low = min(e.span[0] for e in excerpts)
@@ -211,7 +211,7 @@ def choose_law(
         return Choice(None)
     losses: dict[str, Array] = {}
     for i, (name, law) in enumerate(law_of.items()):
-        coefficients = [fitted(_but(parts, j), law).coefficients for j in range(len(parts))]
+        coefficients = [fitted(_all_but(parts, j), law).coefficients for j in range(len(parts))]
         both = zip(parts, coefficients, strict=True)
         losses[name] = np.array([_left_out(R, x, law, all_terms) for R, x in both])
         tick(0.3 + 0.7 * (i + 1) / len(LAWS))
@@ -262,7 +262,7 @@ def _parts(
     return parts
 
 
-def _but(parts: Sequence[Array], j: int) -> Array:
+def _all_but(parts: Sequence[Array], j: int) -> Array:
     """Combine the factors of all parts except part j."""
     return triangular_factor([R for i, R in enumerate(parts) if i != j], parts[j].shape[1])
 

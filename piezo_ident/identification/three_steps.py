@@ -4,8 +4,8 @@
 """
 The three steps on labelled records: delay from steps, G from noise, H from a triangle.
 
-H is fitted last, with thresholds that were chosen or set.  The models that the steps lead to are
-compared by their free run on samples that no step fits.
+H is fitted last.  Free runs over held-out samples then choose between a sum of plays and a wider
+law from all motion, with and without pairs of slow poles and zeros, and with and without G.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def fit_three_steps(
     progress: Progress,
     steps: Steps,
 ) -> FitOutcome:
-    """Take the missing steps, and choose between the models that they lead to."""
+    """Take the missing steps, and choose between models by their error on held-out samples."""
     started, steps = with_starts(runs), steps.beside(settings.delay)
     delay_result = steps.delay or first_step(started, settings, progress)
     delay = Delay(delay_result.samples)
@@ -91,7 +91,7 @@ def fit_three_steps(
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Results of the second and the third step, and the squares left on the selection data."""
+    """Results of steps 2 and 3; `left` is the sum of squared errors on held-out samples [m^2]."""
 
     runs: Sequence[Run]
     fit: Sequence[Excerpt]
@@ -139,7 +139,7 @@ class _LabelledFitter:
         return _Fitted(runs, fit, held, dynamics, hysteresis, model, squares_left(model, runs))
 
     def without_pairs(self, best: _Fitted, started: Sequence[Run]) -> _Fitted:
-        """Replace a model whose G holds pairs that H may replace, if a smaller G errs no more."""
+        """Replace a G with pairs by the smallest G that errs at most `AS_WELL` above the best."""
         G, settings = best.model.dynamics, self.settings
         if without_pairs(G, self.rate).a.size == G.a.size:
             return best
