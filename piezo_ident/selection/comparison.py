@@ -6,8 +6,8 @@ Compare fits by their prediction of held-out data.
 
 The error of a candidate is the geometric mean of two mean squares.  One mean square holds out
 interleaved blocks, the other whole kinds of motion.  Blocks alone would prefer an H that follows
-known motion and errs on other motion; kinds alone are too few.  If errors are alike, the candidate
-with the fewest parameters wins.
+known motion and errs on other motion; kinds alone are too few.  Among the errors within `ALIKE` of
+the least, the candidate with the fewest parameters wins.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Candidate:
 
     @property
     def price(self) -> float:
-        """Error divided by `EFFECT` for each effect, so that an effect must lower it as much."""
+        """Error over ``EFFECT**effects``: each effect must lower the error to `EFFECT` of it."""
         return float(self.error / EFFECT**self.effects)
 
 
@@ -89,7 +89,7 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
-    """Find the best candidate with more effects than `chosen`; None unless it errs less."""
+    """Find the best candidate with more effects than `chosen`; None if it errs about as much."""
     more = [c for c in candidates if c.effects > chosen.effects]
     best = min(more, key=lambda c: c.error, default=None)
     return best if best is not None and ALIKE * best.error < chosen.error else None

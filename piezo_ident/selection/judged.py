@@ -13,7 +13,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.record.record import Piece
 
 if TYPE_CHECKING:
-    # a prediction needs no fit, so it does not import scipy.signal
+    # at run time this import would load scipy.signal for each prediction
     from piezo_ident.fitting.free_run import Fit
 
 
@@ -76,7 +76,7 @@ class Promise:
     Expected free-run errors on another record of the same stage, % of stroke.
 
     `same` is for the same kinds of motion in the same shares.  `other` is for motion of another
-    kind within the swings and speeds of these records.  `other` is None, unknown, if every segment
+    kind within the swings and speeds of these records.  `other` is unknown (None) if every segment
     of motion was fitted, or if all motion has one kind.  Hum, drift and other effects of time
     count in full, because another record has them and the model lacks them.
     """
@@ -90,6 +90,6 @@ class Promise:
         if self.other is None:
             return (
                 f'{self.same:.3g} % of stroke on such motion; the error on another kind of motion '
-                'is not known, as no other kind was held out: play `identification_loops`'
+                'is unknown, as no other kind was held out: play `identification_loops`'
             )
         return f'{self.same:.3g} % of stroke, {self.other:.3g} % on another kind of motion'

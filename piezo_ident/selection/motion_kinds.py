@@ -4,9 +4,9 @@
 """
 Find kinds of motion in a record without labels, from the voltage in each block.
 
-A block is described by the mean, the size and the speed of its voltage.  Similar blocks form a
-kind.  The kinds with the smallest and the largest mean, size and speed are always fitted.  A
-model fitted to the other kinds would extrapolate to these kinds.
+The mean, the size (standard deviation) and the speed (rms change per sample) of its voltage
+describe a block.  Ward clustering of these numbers gives `KINDS` kinds.  A kind is always fitted
+if its mean, size or speed lies beyond all other blocks, as other kinds would extrapolate to it.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def description(u: Array) -> Array:
 
 
 def _is_edge(x: Array, own: Mask) -> bool:
-    """Tell whether a kind has the smallest or the largest value of any property."""
+    """Tell whether the mean of a kind lies beyond all other blocks in any property."""
     mean = x[own].mean(axis=0)
     rest = x[~own]
     if not rest.size:
