@@ -8,9 +8,9 @@ The scale of the error is
 
     q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2 + (c_N N)^2,
 
-in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  For each kind k
-of K kinds of motion, the other kinds give q, and r_k^2 is the mean square of error over q.  A new
-kind has each r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and
+in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  The other kinds
+give q on kind k of K kinds of motion, and r_k^2 is the mean square of error over q.  A new kind
+has each r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and
 A. Ramdas, J. Am. Stat. Assoc. 118(544), 2023, doi:10.1080/01621459.2022.2060112.  The half width
 at level p is q lambda sqrt(1 + 1/K), where lambda solves
 
@@ -118,8 +118,8 @@ class BandStream:
     Half width of a stream of predictions, block by block.
 
     `plays` and `creep` say whether the memory of the plays, and the creep of earlier motion, are
-    known at the start.  Otherwise the band contains all possible memory of the plays, until the
-    voltage has swept them, and the creep that may go on.  Raises ModelError if the model carries
+    known at the start.  Otherwise the band contains all possible outputs of the plays until the
+    voltage has swept them, and the largest possible creep.  Raises ModelError if the model carries
     no band, and ConfigError if the level does not lie between 0 and 1.
     """
 

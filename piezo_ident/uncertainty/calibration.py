@@ -11,7 +11,7 @@ strategies for data with temporal, spatial, hierarchical, or phylogenetic struct
 40(8), 2017, doi:10.1111/ecog.02881.
 
 H errs more on loops between the fitted loops.  A kind with fitted samples therefore counts with
-its own error, or with the error that kinds without fits give for its motion, whichever is larger.
+the larger of its own error and the error that kinds without fitted samples give for its motion.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from scipy.optimize import least_squares
 BLOCKS, SHORTEST = 80, 20
 #: smallest scale of the error in spans: a tenth of a bit of a 16 bit converter
 LEAST = 1.5e-6
-#: weight of the prior, the error of all blocks over the largest value of the motion, against one
-#: block (taste: the prior decides only coefficients that the blocks leave open)
+#: weight of the prior against one block (taste).  The prior is the error of all blocks over the
+#: largest value of the motion, and decides only coefficients that the blocks leave open
 PRIOR = 1e-3
 
 
@@ -112,7 +112,7 @@ def blocks_of(
 
 
 def _unfitted(e2: Array, use: Mask, held: Mask) -> float:
-    """Compute the mean squared error of samples held out over that of all samples."""
+    """Compute the ratio of mean squared errors, held-out samples over all samples; at least 1."""
     own = use & held
     if min(own.sum(), (use & ~held).sum()) < SHORTEST or not e2[use].any():
         return 1.0

@@ -4,11 +4,11 @@
 """
 Describe each sample of a motion by swing, speed and nesting, with which errors of free runs grow.
 
-- Swing: the distance between the last two turning points of the voltage, or from the last turning
-  point to the voltage, whichever is larger.  The misfit of H grows with the size of the loop.
+- Swing: the larger of two distances: between the last two turning points of the voltage, and from
+  the last turning point to the voltage.  The misfit of H grows with the size of the loop.
 - Speed: the largest recent change of the predicted displacement, which fades with the slowest mode
   of G.  The misfit of G and of the delay grows with speed.
-- Nesting: the squared mean of one minus swing over the last range of path (taste).  Small loops
+- Nesting: the squared mean of ``1 - swing`` over a recent path of one range (taste).  Small loops
   inside a wide loop drift on many stages, and a sum of plays closes them.
 
 All three follow from the past alone, so a stream gives the same values as a whole record.
@@ -21,8 +21,8 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import alive, ordered_kernel
 from piezo_ident.model.stage_model import StageModel
 
-#: way back after which an extreme of the voltage counts as a turning point, as a share of the
-#: range (taste): more than noise of a measured voltage, less than loops whose error matters
+#: way back that makes an extreme of the voltage a turning point, as a share of the range (taste).
+#: The noise of a measured voltage is smaller, and a loop whose error matters is larger
 TURN = 2e-3
 #: shortest and longest time in which the speed of the past fades [samples, s]; taste
 FEWEST, LONGEST = 10.0, 0.1

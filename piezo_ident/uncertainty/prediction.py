@@ -28,9 +28,9 @@ def half_widths(
     """
     Compute the half width of the band of each piece of a record [m].
 
-    `estimated` says for each piece whether its displacement gave the start; the plays of such a
-    piece may err until they are swept.  Without `estimated` the voltage alone is known: a start at
-    rest gives the plays, and the band contains the creep of earlier motion.
+    `estimated` says for each piece whether its displacement gave the start.  The plays of such a
+    piece may err until they are swept.  Without `estimated` only the voltage is known.  A start at
+    rest then gives the plays, and the band contains the creep of earlier motion.
     """
     half = list[Array]()
     for pieces in connected_pieces(record):

@@ -4,13 +4,13 @@
 """
 Promise the error of another record, and give the model its prediction band.
 
-The promise for the same kinds of motion is the rms error of the model on its records, raised to
-the error of held-out samples, and to the error without a fitted start.  The promise for motion of
-another kind is the geometric mean of q times the geometric mean of r_k
-(`piezo_ident.uncertainty.band`), over all pairs of a swing, with its nesting, of one kind and a
-speed of another kind.  About half of the kinds err more.
+The promise for the same kinds of motion is the rms error of the model on its records.  This error
+is raised to the error of held-out samples, and an unknown start adds its error.  The promise for
+another kind of motion is the geometric mean of q times the geometric mean of r_k, in the notation
+of `piezo_ident.uncertainty.band`.  The mean of q pairs the swing and nesting of each kind with the
+speed of each kind.  About half of the kinds err more than this promise.
 
-After a diagnosis the refined model carries no hum, drift or wandering gain: they count in full.
+Hum, drift and a wandering gain count in full, as the refined model of a diagnosis lacks them.
 
 Limits: both promises are for the rms error over a whole record, in % of the stroke of the judged
 records.  A zero of the sensor that has clearly moved does not count.

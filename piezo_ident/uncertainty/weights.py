@@ -20,7 +20,7 @@ doi:10.1214/10-AOS792.  An effect that contains narrower effects counts as two c
 H and a retuned G are changes without a name.  They belong to ``none of these``, as does a complete
 model, n = 0.  A further change is `FURTHER` times as likely as the first.
 
-Limits: effects that were not fitted, as too small or with tests of their own, have no weight.
+Limits: only fitted sets have a weight; small effects, and effects with own tests, are not fitted.
 """
 
 from __future__ import annotations
