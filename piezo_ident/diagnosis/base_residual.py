@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Refit H, and find faults, lines and noise in the residual, before effects are searched.
+Leave out faults, refit H, and find lines and noise in the residual, before effects are searched.
 
-H is refitted by the free-run error, so that an error of H is not mistaken for an effect.  The
-remaining residual gives lines and the noise floor, and thereby the error to explain.
+The residual of the model as given shows the faults.  H is then refitted by the free-run error, as
+plays and by a wide law.  The residual of the wide law shows lines, other axes and the noise.
 """
 
 from __future__ import annotations

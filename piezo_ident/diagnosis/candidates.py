@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-List the candidates: each treatment of H and G, with each effect, then with one more effect.
+List the candidates: sets of effects, each beside treatments of H (given, plays, wide) and G.
 
-The hysteresis of a piezo is never exactly a sum of plays.  An effect that already acted during the
-identification has also distorted the identified H and G.  Effects are therefore tried beside the H
-that fits best.  They are also tried with a retuned G if retuning alone clearly lowers the error.
-Effects that follow the path of the voltage are tried beside the H as given, too (`decision`).
+The hysteresis of a piezo is never exactly a sum of plays, and an effect during the identification
+has distorted H and G.  Each effect is therefore tried beside the best H, and beside a retuned G if
+retuning alone clearly lowers the error.  Effects of the path are tried beside the given H, too.
+The best sets get all treatments.  One more effect is added if more than `LITTLE` is left.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class CandidateSearch:
 
     def of(self, wide: Fitted, most: int) -> Candidates:
         """Fit all candidates with up to `most` effects beside the effects of a wide refit."""
-        candidates = self._ways(wide)
+        candidates = self._without_effect(wide)
         least = min(map(candidates.left, candidates.all))
         path = [effect for effect in self._effects if effect.rate_independent]
         best = min((c for c in candidates.all if not c.retunes), key=candidates.left)
@@ -92,7 +92,7 @@ class CandidateSearch:
                 # the effect must lower the error nearly as much as a refit of H
                 some, goal = path, least + TAKES * max(candidates.left(base) - least, 0.0)
             candidates = candidates.and_these(self._with_each(base, some, goal))
-        candidates = self._in_all_ways(candidates, 1)
+        candidates = self._with_all_treatments(candidates, 1)
         for size in range(1, most):
             bases = self._worth_extending(candidates, size)
             if not bases:
@@ -101,10 +101,10 @@ class CandidateSearch:
                 goal = PROMISING * candidates.left(base)
                 more = self._with_each(base, self._effects, goal)
                 candidates = candidates.and_these(more)
-            candidates = self._in_all_ways(candidates, size + 1)
+            candidates = self._with_all_treatments(candidates, size + 1)
         return candidates
 
-    def _in_all_ways(self, candidates: Candidates, size: int) -> Candidates:
+    def _with_all_treatments(self, candidates: Candidates, size: int) -> Candidates:
         """Fit the best sets of a size with all treatments of H and G."""
         # a wide H may have absorbed an effect in part and errs under other motion; a sum of plays
         # may leave an error that another effect fits by accident
@@ -112,10 +112,12 @@ class CandidateSearch:
         for best in bests:
             # a treatment with a larger error than the best treatment does not count
             goal = np.inf if best is bests[0] else self._residual.noise + candidates.left(best)
-            candidates = candidates.and_these(self._other_ways(candidates, best, goal))
+            candidates = candidates.and_these(self._other_treatments(candidates, best, goal))
         return candidates
 
-    def _other_ways(self, candidates: Candidates, best: FittedSet, goal: float) -> list[FittedSet]:
+    def _other_treatments(
+        self, candidates: Candidates, best: FittedSet, goal: float
+    ) -> list[FittedSet]:
         """Fit the set of a candidate with all other treatments of H, and then with a retuned G."""
         simulator, have = self._simulator, {c.way for c in candidates.of(best.effects)}
         state = candidates.as_given.fitted.state.with_effects_of(best.fitted.state)
@@ -137,8 +139,8 @@ class CandidateSearch:
             more += [replace(last, fitted=retuned)] if retuned else []
         return more
 
-    def _ways(self, wide: Fitted) -> Candidates:
-        """Fit the candidates without an effect, except for the effects of the wide refit."""
+    def _without_effect(self, wide: Fitted) -> Candidates:
+        """Fit each treatment without an effect, except for the effects of the wide refit."""
         simulator, plays = self._simulator, self._residual.plays
         state = replace(self._residual.given, effects=wide.state.effects)
         given = fit_jointly(simulator, state)
@@ -155,7 +157,7 @@ class CandidateSearch:
     def _with_each(
         self, base: FittedSet, some: Sequence[type[Effect]], goal: float
     ) -> list[FittedSet]:
-        """Fit candidates with one more effect; each must promise an error below `goal`."""
+        """Fit candidates with one more effect; a fit ends early if it cannot reach `goal`."""
         effects = [
             effect
             for effect in some

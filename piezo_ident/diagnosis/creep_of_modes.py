@@ -6,8 +6,8 @@ Add the creep of each axis to shared modes, if slow motion that is held out show
 
 The error of slow motion is compared with and without creep as in
 `piezo_ident.selection.comparison`: parts of the time are held out, and whole kinds of motion.
-Errors of a kind count relative to their rms without creep.  Otherwise creep would imitate what the
-modes lack of the hysteresis of wide motion, and spoil the prediction of other motion.
+Errors of a kind count relative to their rms without creep.  Otherwise creep would imitate errors
+of the modes on wide motion, and spoil the prediction of other motion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ELEMENTS, PARTS = 5, 40
 
 def with_creep(modes: SharedModes, records: Sequence[Record]) -> SharedModes:
     """
-    Add creep to each axis if it takes most of the slow error, where that is held out.
+    Add creep to each axis if at most `EFFECT` of the held-out slow mean square is left with it.
 
     Slow motion is the mean of blocks of `AT_ONCE`.
     """

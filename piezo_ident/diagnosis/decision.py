@@ -5,21 +5,22 @@
 Decide which candidate is taken, from the errors of all candidates on held-out data.
 
 A candidate is a set K of effects beside one treatment of H and G.  Its error E is the geometric
-mean of two mean squares: with spread sets of blocks held out, and with whole kinds of motion held
+mean of two mean squares: with interleaved blocks held out, and with whole kinds of motion held
 out.  The error of a set is the error of its best treatment:
 
     left(K) = max(E(K) - noise, 0) + NOISE_SHARE noise.
 
-A set is admissible if it lowers the error by at least the smallest effect.  Each of its effects
-must also remove most of the error that is left without this effect.  A second effect must do so on
-spread blocks alone, too.  The admissible set with the smallest error is taken, or a set with about
-the same error and fewer parameters.  Sets of the same size with a slightly larger error are its
-rivals; the set and its rivals form a class.  Size decides instead of significance: in 100,000
-samples any law of the right trend gains a significant part.
+A set is admissible if left falls by the square of `SMALLEST_EFFECT` from the H as given, and if
 
-A wide H can imitate an effect that follows the path of the voltage, so such an effect gains little
-beside a refitted H.  If the effect has set in since the identification, the H as given lacks it.
-The effect is then the finding if it gains most of what a refit gains, beside the H as given.
+    left(K) <= TAKES^(|K| - |K'|) left(K')     for every part K' of K, the empty set included,
+
+and on interleaved blocks alone if K' has an effect.  A change of G must exceed the known error of
+G, and the last effect must gain more than chance.  The set that leaves least is taken, or a set
+with fewer parameters within `ALIKE`.  Sets of its size within `RIVALS` form a class with it.
+
+A wide H imitates an effect of the path of the voltage.  If no set is admissible in labelled
+records, it is taken if its gain beside the given H is ``1 - TAKES`` of the gain of a refit.
+It has then set in since the identification.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class Candidates:
         return tuple(sorted(filter(None, bests), key=self.left))
 
     def is_admissible(self, effects: tuple[str, ...]) -> bool:
-        """Return whether a set is large enough, and each effect removes most of the error."""
+        """Return whether a set fulfils the conditions of this module."""
         best = self.best(effects)
         if not effects or best is None or self.rows.passes < PASSES:
             return False
@@ -158,14 +159,14 @@ class Candidates:
             other = self.best(part, effects)
             if other is None:
                 continue
-            before, most = self.left(other), TAKES ** (len(effects) - len(part))
+            before, share = self.left(other), TAKES ** (len(effects) - len(part))
             if not change_g(effects):
                 before = min(before, self._missed_by_g(part))
-            if left > most * before:
+            if left > share * before:
                 return False
             # beside another effect, whole kinds of motion must not be the only evidence
             own, rest = (self.beyond_noise(c.fitted.mean_square) for c in (best, other))
-            if part and own > most * rest:
+            if part and own > share * rest:
                 return False
             changes = change_g(tuple(set(effects) - set(part)))
             if changes and self.rows.percent(before - left) < self.missed:
@@ -198,7 +199,7 @@ class Candidates:
         return self.left(self.as_given)
 
     def like_refit(self) -> tuple[FittedSet, ...]:
-        """List effects of the path that gain most of what a refit gains, the best first."""
+        """List effects of the path with ``1 - TAKES`` of the gain of a refit, the best first."""
         given, refit = self.given, self.left(self.without())
         if given - refit < self.rows.square(SMALLEST_EFFECT) or self.rows.passes < PASSES:
             return ()
@@ -284,7 +285,7 @@ def change_g(effects: Sequence[str]) -> bool:
 
 
 def _narrower(effects: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield the sets with an effect in the place of a wider effect."""
+    """Yield the sets with a special case in the place of an effect that `contains` it."""
     for name in effects:
         for other in find_effect(name).contains:
             yield tuple(sorted({*effects, other} - {name}))

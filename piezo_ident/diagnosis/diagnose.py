@@ -4,11 +4,11 @@
 """
 Diagnose a model: from measured data to the effect that the model lacks.
 
-1. `base_residual` leaves faults of the data out and refits H.  The remaining residual gives lines
-   and the noise, and thereby the error to explain.
+1. `base_residual` leaves faults of the data out and refits H.  The residual that remains gives
+   lines and the noise.
 2. `candidates` fits each treatment of H and G, then with each effect, then with one more effect.
-   `search` finds the effects of a round: `trial_scores` scores them, `fit` fits the best.
-3. `decision` takes a candidate by one ratio.
+   `search` finds the effects of a round: `trial_scores` scores them, `joint_fit` fits the best.
+3. `decision` takes a set of effects by ratios of errors on held-out data.
 4. `refits` chooses the H of the refined model, by whole kinds of motion.
 5. `verdict` judges, `refined_model` builds the model, and `messages` words the result.
 """

@@ -43,7 +43,7 @@ def with_earlier_motion(simulator: Simulator, fitted: Fitted) -> Fitted:
     start = replace(state, fading=times, earlier=none)
     if not _may_help(simulator, fitted, start):
         return fitted
-    rested, crept = (tried(_settled, simulator, one) for one in (state, start))
+    rested, crept = (tried(_refitted, simulator, one) for one in (state, start))
     if rested is None or crept is None:
         # a fit fails, so the data do not hold this creep
         return fitted
@@ -83,7 +83,7 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
     return bool(np.all((ends.min(axis=1) - doubt <= left) & (left <= ends.max(axis=1) + doubt)))
 
 
-def _settled(simulator: Simulator, state: State) -> Fitted:
+def _refitted(simulator: Simulator, state: State) -> Fitted:
     """Fit a state, again and again with fresh columns of H, as long as the error falls."""
     fitted = fit_jointly(simulator, state)
     for _ in range(POLISHING):

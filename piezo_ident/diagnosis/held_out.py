@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Choose the blocks that are held out together, and the errors that they show."""
+"""Assign blocks to kinds of motion, which are held out as a whole; collect errors by segment."""
 
 from __future__ import annotations
 
@@ -94,9 +94,9 @@ def held_out_kinds(
     """
     Assign each block to a kind of motion, shape (blocks,), and name the kinds.
 
-    `labels` holds the label of each block, and `commands` its rows.  The smallest kinds are
-    joined.  Mean, size and speed of the command replace missing labels.  Parts of the time replace
-    them if the command has too few kinds.
+    `labels` holds the label of each block, and `commands` its rows.  A kind is a label, and the
+    smallest kinds are joined.  Clusters by mean, size and speed of the command replace missing
+    labels.  Parts of the time replace the clusters if these are too few.
     """
     size: Counter[str] = Counter()
     for label, u in zip(labels, commands, strict=True):
@@ -127,7 +127,7 @@ def _by_command(commands: Sequence[Array]) -> tuple[Integers, tuple[str, ...]] |
     kinds = kinds_of(np.array([description(u) for u in commands]))
     if kinds is None:
         return None
-    # kinds at the edge of place, size or speed would require extrapolation: they are spread
-    spread = KINDS + interleaved(kinds.size)
-    group = np.unique(np.where(kinds < 0, spread, kinds), return_inverse=True)[1]
+    # kinds at the edge of mean, size or speed would require extrapolation: they are interleaved
+    sets = KINDS + interleaved(kinds.size)
+    group = np.unique(np.where(kinds < 0, sets, kinds), return_inverse=True)[1]
     return group, (ALIKE,) * (int(group.max()) + 1)

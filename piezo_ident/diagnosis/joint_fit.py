@@ -5,7 +5,7 @@
 Fit the weights of H, offsets and effects jointly by the free-run error.
 
 The fit uses Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay stay,
-except for a factor near one (`retuning.retuned`).  A larger change of them is an effect, and so a
+except for a factor near one (`state.retuned`).  A larger change of them is an effect, and so a
 candidate.
 """
 
@@ -99,7 +99,7 @@ class Fitted:
         Columns that are not on a bound.
     parameters, prior : tuple of FreeParameter, ndarray, shape (p,)
     errors, transfer : ndarray, shape (blocks,)
-        Sum of squares of each block, held out in spread sets and in whole kinds of motion.
+        Sum of squares of each block, held out in interleaved sets and in whole kinds of motion.
     pull : Pull or None
         Normal equations of the information besides the rows, for the free columns.
     """
@@ -129,14 +129,14 @@ class Fitted:
 
     @property
     def mean_square(self) -> float:
-        """Mean square error of the blocks held out in spread sets, normalised."""
+        """Mean square error of the blocks held out in interleaved sets, normalised."""
         return float(self.errors.sum() / self.e.size)
 
     def held_out_residual(self, rows: Rows, sets: Integers | None = None) -> Array:
         """
         Compute the residual of every row with parameters fitted to other blocks; shape (n,).
 
-        Blocks with the same number in `sets`, by default spread sets, are held out together.
+        Blocks with the same number in `sets`, by default interleaved, are held out together.
         """
         prior = self.prior if sets is None else firm(rows, self.state, self.prior, self.moving)
         sets = rows.fold if sets is None else sets

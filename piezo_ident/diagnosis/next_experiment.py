@@ -95,7 +95,7 @@ def _doubts(diagnosis: Diagnosis) -> Iterator[tuple[tuple[str, ...], str, str]]:
         yield tuple(c.name for c in diagnosis.candidates), '', untested
 
 
-# -- what the data have --------------------------------------------------------------------------
+# -- motions in the data -------------------------------------------------------------------------
 
 
 def _rests(records: Sequence[Record]) -> Iterator[tuple[float, float]]:

@@ -104,9 +104,9 @@ def _hidden_shifts(simulator: Simulator, given: State, fitted: Fitted, before: A
     An effect that the given model lacks can imitate a shift.  Two estimates must therefore agree
     in sign: the mean error of the given model, and the displacement at rest relative to the given
     model.  An effect that already acted during the identification distorts at most one of the two.
-    The smaller estimate counts.  It must exceed `MOVED_ZERO` times an error: the larger of the
-    remaining error and the expected error of the given model, or the actual error of the given
-    model if that is less.  `before` is the mean square of the actual error, shape (records,).
+    The smaller estimate counts.  It must exceed `MOVED_ZERO` times ``min(b, max(r, m))``.  The rms
+    errors are b of the given model on these records, r of the fit, and m of the given model as its
+    file expects it.  `before` is b^2, shape (records,).
     """
     rows, model, state = simulator.rows, simulator.model, fitted.state
     left = np.sqrt(means(fitted.e**2, rows.of_record))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Refit H, and walk to the H of the refined model.
+Refit H, and choose the H of the refined model.
 
-Held-out blocks between fitted blocks must not choose H.  A wide H with a retuned G may fit such
-blocks well and err widely under other motion.  The walk begins at the given H.  Each step to a
-wider H must remove most of the error on whole kinds of motion.
+The walk tries the given H, then plays, a retuned G, wide laws, and a wide law with a retuned G.
+A step is taken if it leaves at most `TAKES` of the error on whole kinds of motion.  Interleaved
+blocks alone would choose a wide H with a retuned G that errs widely under other motion.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def walk(
     best: FittedSet | None,
     tick: Callable[[], None],
 ) -> FittedSet:
-    """Choose the H of the refined model, beside the effects of the best candidate."""
+    """Choose the H of the refined model, beside the effects of the best candidate, or a gain."""
 
     def goal() -> float:
         return candidates.noise + TAKES * _left(candidates, last.fitted)

@@ -71,7 +71,7 @@ class Rows:
     block, of_record : ndarray of int, shape (n,)
         Block and record of each row.
     fold, group : ndarray of int, shape (blocks,)
-        Numbers of blocks that are held out together: spread over all data, or as kinds of motion.
+        Equal numbers are held out together: interleaved blocks (fold), or kinds of motion (group).
     label, labels : tuple of str
         Segment label of each block, and name of each group.
     stroke : float
@@ -107,7 +107,7 @@ class Rows:
 
     @functools.cached_property
     def highest_frequency(self) -> float:
-        """Frequency below which all but a millionth of the moving power of each run lies [Hz]."""
+        """Frequency below which all but a millionth of the power of the command lies [Hz]."""
         pairs = ((run, np.flatnonzero(k)) for run, k in zip(self.runs, self.keep, strict=True))
         judged = ((r, slice(k[0] * self.m, (k[-1] + 1) * self.m)) for r, k in pairs if k.size)
         found = (highest_frequency(run.u[cut], run.piece.sample_rate) for run, cut in judged)

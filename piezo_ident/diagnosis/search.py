@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Run one round of the search: find the candidates that lower the error on held-out data.
+Run one round of the search: add each candidate effect in turn to one fit.
 
-Each candidate is tried (`trial_scores`).  Its gain is compared with the gain on surrogates of the
-residual, which chance alone produces.  The most promising candidates are then fitted jointly.
+Linear trials (`trial_scores`) score the effects on held-out blocks.  The best `JOINT_FITS` effects
+and look-alikes of the best are fitted jointly with H: each for `FIRST` iterations, then the best.
 """
 
 from __future__ import annotations
@@ -45,21 +45,20 @@ WORTH_END = 0.5
 #: trials of a candidate that start a joint fit, iterations of this fit, and candidates of a round
 #: that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: a trial beside plays is a start up to this multiple of the error before.  Another start, and
-#: another candidate, is given up beyond the next two multiples of the best error
+#: largest errors that are followed: a start beside plays over the error before; another start over
+#: the best start of its effect; another candidate over the best candidate
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
 #: a fit ends after a step that gains less than this share of the mean square of the noise, or of
 #: the smallest effect if that is smaller
 OF_LEAST = 0.01
-#: size of a meaningless difference, rms in % of stroke: weights of H never describe a stage more
-#: exactly
+#: meaningless difference, rms in % of stroke: weights of H describe no stage more exactly
 INDISTINCT = 0.01
 #: interval at which a caller may stop the search [s]
 ASKED = 0.1
 #: a candidate after a few iterations: its best fit, and its best fit from a wide H
-_Begun = tuple[Fitted, Fitted]
+_ShortFits = tuple[Fitted, Fitted]
 _error, _by_error = attrgetter('mean_square'), attrgetter('error')
 
 
@@ -75,7 +74,7 @@ class Round:
     gains : dict of str to float
         Mean square that each possible candidate gains, in its best trial or in its joint fit.
     contenders : tuple of Fitted
-        Candidates after the joint fit that show, ordered by error.
+        Candidates after the joint fit that pass `trial_scores.shows`, ordered by error.
     chance : dict of str to float
         Largest mean square that a candidate gains on surrogates of the residual.
     visible : dict of str to float
@@ -124,7 +123,7 @@ def search_round(
     }
     _add_plain_starts(columns, before, starts)
     fits = _JointFits(columns.simulator, before, noise, goal, tick)
-    contenders = fits.to_the_end(fits.begun(starts))
+    contenders = fits.full(fits.short(starts))
     tick(1.0)
     gains = {name: (whole - scores[0].error) / n for name, scores in trials.items()}
     for c in contenders:
@@ -192,7 +191,7 @@ def _add_plain_starts(
 
 class _JointFits:
     """
-    Joint fits of the candidates of a round: all of them begin, and the best go to the end.
+    Joint fits of the candidates of a round: short fits of all, then full fits of the best.
 
     A fit ends early if it cannot reach the mean square `worth`.
     """
@@ -212,10 +211,10 @@ class _JointFits:
     def _alive(self) -> None:
         self._tick(self._share)
 
-    def begun(self, starts: Mapping[type[Effect], Sequence[State]]) -> list[_Begun]:
+    def short(self, starts: Mapping[type[Effect], Sequence[State]]) -> list[_ShortFits]:
         """Fit all starts of each effect for a few iterations; the best effect comes first."""
         whole = least = self._before.mean_square
-        found = list[_Begun]()
+        found = list[_ShortFits]()
         for i, (effect, states) in enumerate(starts.items()):
             self._share = 0.5 + 0.5 * i / len(starts)
             self._alive()
@@ -238,27 +237,27 @@ class _JointFits:
     ) -> Fitted:
         return fit_jointly(own, state, self._before.base, until=until, tick=tick)
 
-    def to_the_end(self, begun: Sequence[_Begun]) -> list[Fitted]:
+    def full(self, short: Sequence[_ShortFits]) -> list[Fitted]:
         """Fit the best candidates to the end; return the candidates that show, the best first."""
-        found = [fitted for fitted, _ in begun]
+        found = [fitted for fitted, _ in short]
         gains = [self._before.mean_square - _error(one) for one in found]
         # a few iterations cannot rank two candidates with nearly equal errors
         level = LEVEL * max(map(_error, found[:FINAL]), default=0.0)
         is_shown = False
-        for i, (begun_fit, other) in enumerate(begun):
+        for i, (short_fit, other) in enumerate(short):
             is_far = is_shown and 0.0 < gains[0] and gains[i] < WORTH_END * gains[0]
-            if is_far or _error(begun_fit) > level:
+            if is_far or _error(short_fit) > level:
                 break
             # a candidate that stays further behind the first is not its rival
             goal = FORM_RATIO * _error(found[0]) + self._done if is_shown else self._worth
-            fitted = tried(self._polished, begun_fit, goal)
+            fitted = tried(self._polished, short_fit, goal)
             if fitted is None:
                 self.warnings.append(
-                    f'{begun_fit.name} was fitted in {FIRST} iterations only: the fit fails then'
+                    f'{short_fit.name} was fitted in {FIRST} iterations only: the fit fails then'
                 )
                 continue
             found[i], is_shown = fitted, self._shows(fitted)
-            if other is begun_fit or (is_shown and _error(fitted) < self._done):
+            if other is short_fit or (is_shown and _error(fitted) < self._done):
                 continue
             # a few iterations cannot rank the two bases
             near = AHEAD * _error(fitted)

@@ -14,9 +14,9 @@ one multisine of each amplitude that is held out:
 - ``softening and plays``: softening, and plays of extension and voltage inside the loop.
 
 Hysteresis inside the loop moves the modes with the amplitude.  Hysteresis in front of the
-mechanics changes gain and phase, not the modes.  `loop_hysteresis` is therefore named only if
-linear models of each amplitude err clearly less with their own modes than with common modes.
-Otherwise a law with more signals may fit hysteresis of the voltages better than plays in front.
+mechanics changes gain and phase, not the modes.  `loop_hysteresis` needs linear models of each
+amplitude that err by `WORTH` less with modes of their own than with common modes.  A law inside
+the loop must also leave at most `TAKES` of the mean square error of the chains.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _found(
     tests: bool,
 ) -> SharedModesFinding | None:
     every, v0 = sines
-    taught, held_out = held_apart(every)
+    to_fit, held_out = held_apart(every)
     errors = {'chains': percent_of(held_out, _steady(chains, held_out, v0))}
     # no law errs by less than the noise
     can_win = _beats(_noise(held_out), errors['chains'])
@@ -177,7 +177,7 @@ def _found(
     law = next(law for law in LAWS if errors[law] <= limit)
     if law in IN_FRONT or not _beats(errors[law], errors['chains']):
         return None
-    last = [record for part in taught for record in part] if tests else every
+    last = [record for part in to_fit for record in part] if tests else every
     modes = replace(loop_fit(fitted[law], last, iterations=LAST_STEPS), v0=v0)
     modes = _placed(with_creep(modes, records), records)
     progress('shared modes', 1.0)
@@ -236,7 +236,7 @@ def held_apart(
     records: Sequence[PeriodicRecord],
 ) -> tuple[list[list[PeriodicRecord]], list[PeriodicRecord]]:
     """Hold out one record of each group; return the others of each group, and those held out."""
-    # a record that does not repeat judges nothing
+    # the record with the largest weight repeats best, so its error says most
     parts = [sorted(part, key=lambda record: record.weight) for part in groups(records).values()]
     return [part[:-1] for part in parts], [part[-1] for part in parts]
 
@@ -254,13 +254,13 @@ class LawSearch:
 
     def __init__(self, records: Sequence[PeriodicRecord], progress: Progress) -> None:
         self._progress = progress
-        taught, self.held_out = held_apart(records)
-        self._few = [record for part in taught for record in part[-FEW:]]
+        to_fit, self.held_out = held_apart(records)
+        self._few = [record for part in to_fit for record in part[-FEW:]]
         self.groups = [record.group for record in self.held_out]
-        middle = len(taught) // 2
-        self._middle = taught[middle][-FEW:]
+        middle = len(to_fit) // 2
+        self._middle = to_fit[middle][-FEW:]
         progress('shared modes', 0.0)
-        start, _ = choose_order(taught[middle], [self.held_out[middle]], orders=ORDERS)
+        start, _ = choose_order(to_fit[middle], [self.held_out[middle]], orders=ORDERS)
         progress('shared modes', 0.1)
         self.plain = SharedModes.of(start)
         self.linear = loop_fit(self.plain, self._few, iterations=STEPS)

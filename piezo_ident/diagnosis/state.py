@@ -272,8 +272,8 @@ def moved(
 def prior_of(
     rows: Rows, e: Array, p: int, state: State, parameters: Sequence[FreeParameter]
 ) -> Array:
-    """Compute the prior of p numbers of a fit with residual e: the price of moving each."""
-    # neighbouring residuals are similar: a block counts as a few observations, not as thousands
+    """Compute the ridge weight of each of p numbers: variance of the residual e over spread^2."""
+    # neighbouring residuals are similar: a block counts as five observations, not as thousands
     count = e.size / max(1.0, 0.2 * e.size / (rows.edges.size - 1))
     # curves and lags are nearly collinear: only large steps of them have an effect
     plays = 0 if state.law is None else state.law.thresholds.size
@@ -292,10 +292,10 @@ def firm(rows: Rows, state: State, prior: Array, moving: Array) -> Array:
     Example: only a multisine reaches a limit of the slew rate.  Only the start of a record
     determines creep from earlier motion.
     """
-    firm = prior.copy()
-    firm[places_of_decays(state)] += rows.n / FIRM
-    firm[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
-    return firm
+    stronger = prior.copy()
+    stronger[places_of_decays(state)] += rows.n / FIRM
+    stronger[prior.size - moving.shape[1] :] += FIRM * np.sum(moving**2, axis=0)
+    return stronger
 
 
 def places_of_decays(state: State) -> slice:

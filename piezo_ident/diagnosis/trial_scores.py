@@ -4,13 +4,13 @@
 """
 Score the trials of candidates by their gain on held-out data.
 
-A trial switches an effect slightly on.  Its score is the gain of its columns on held-out blocks,
-beside all other columns of the model.
+A trial has a column for each amplitude of an effect: the change of the prediction per small step.
+Least squares fits these columns beside the columns of the model to the residual.  The score is the
+squared error on interleaved held-out blocks.
 
-A trial cannot tell some effects from others.  Creep and drift must therefore show at rest, where
-no hysteresis moves.  A drifting gain must show within single motions, where a gain that depends on
-the kind of motion stays constant.  In these places the effect must have the size that was fitted
-to all data.  The factor
+Trials cannot separate all effects.  Creep and drift must show at rest, where no hysteresis moves.
+A drifting gain must show within single motions, where a gain that depends on the kind of motion
+stays constant.  There the effect must have the size that was fitted to all data.  The factor
 
     kappa = 1 + <c, e> / <c, c>
 
@@ -63,7 +63,7 @@ class Scored:
     coefficients : ndarray, shape (c,)
         Steps of the amplitudes, from the least-squares fit.
     error : float
-        Sum of squares of all blocks, held out in spread sets.  It is infinite for an effect that
+        Sum of squares of all blocks, held out in interleaved sets.  Infinite for an effect that
         is either on or off if its fitted amplitude is not about one.
     chance : float
         Largest decrease of the sum of squares of a surrogate.

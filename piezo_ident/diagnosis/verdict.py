@@ -4,10 +4,10 @@
 """
 Judge the decision: the findings, their certainty, and the questions that the data leave open.
 
-A set of effects that leaves a small error is named; a set with rivals is a class.  A set that
-leaves a larger error explains a part.  If no set is admissible, another H may leave a small error
-on whole kinds of motion.  The refitted H is then the finding, and effects that explain nearly as
-much may hide in it.
+The set of effects that was taken is named, or a class if it has rivals.  If it leaves more than
+`LITTLE` of the error, and more than `SMALLEST_EFFECT`, it explains a part.  If no set was taken,
+the H that `refits.walk` took is the finding if it gains at least `SMALLEST_EFFECT`.  Effects that
+explain nearly as much may hide in this H.
 """
 
 from __future__ import annotations
