@@ -200,7 +200,7 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
     """
     Tell whether the mean errors of small motion and of triangles differ clearly.
 
-    If a stage is not a sum of plays, its small loops stay open: under steps and noise the
+    If a stage is not a sum of plays, its small loops stay open.  Under steps and noise the
     displacement drifts towards the middle of the large loop.  A triangle hides this drift.
     """
     for run in runs:

@@ -239,8 +239,8 @@ def held_out_stretches(u: Array, rate: float, n_held: int) -> Mask:
 
     `n_held` samples are held out in a few stretches spread over the run.  The last stretch lies at
     the end if possible, because only the end shows drift.  The fitted samples must keep the share
-    `STAYS` of the range and of the energy of each frequency band: without its only chirp, a record
-    cannot identify G.  If they lose more, all stretches move towards the beginning.
+    `STAYS` of the range and of the energy of each frequency band, because G needs the only chirp
+    of a record.  If they lose more, all stretches move towards the beginning.
     """
     n, size = u.size, n_held // STRETCHES
     ends = np.linspace(0, n, STRETCHES + 1).astype(int)[1:]

@@ -107,7 +107,7 @@ def _model(stage: Stage, rate: float, scaling: Scaling) -> StageModel:
 
 
 def _compact(H: Hysteresis) -> Hysteresis:
-    """Drop the plays without weight from H, and a span that a file of plays does not hold."""
+    """Drop the plays of weight zero from H, and the span, which a file of plays lacks."""
     if H.curves is not None or H.bias is not None:
         return H
     used = H.weights > 0.0

@@ -31,9 +31,9 @@ ROUNDING = 1e-9
 PARTS, ROWS, PLAYS = 8, 500, 8
 #: rates of the decays of a slow drift, in 1 / duration
 DECAYS = 2.0 ** np.arange(-1.0, 7.0, 0.5)
-#: A position is under control if its bend, as a share of its travel, is below `STRAIGHT`, and its
-#: drive bends more than `BENT` times as much.  A measured position under control bent by less than
-#: 2.4e-4, and a measured drive 18 times as much
+#: largest bend of a position under control, as a share of its travel, and smallest ratio of the
+#: bend of its drive.  A measured position under control bent by less than 2.4e-4, and its drive 18
+#: times as much
 STRAIGHT, BENT = 5e-4, 15.0
 
 

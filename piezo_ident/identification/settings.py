@@ -34,8 +34,8 @@ class Settings:
         The paper takes ten.  By default, number and places are chosen by held-out error.
     solver : {'least_squares', 'swarm', 'joint'}
         Solver of the weights.  Least squares finds the optimum of this convex problem.  The swarm
-        is the solver of the paper, and the model keeps its weights unless `polish` is set.
-        'joint' fits delay, G and H in one step, as to a record without labels.
+        is the solver of the paper; `polish` replaces its weights.  The solver 'joint' fits delay,
+        G and H in one step, as to a record without labels.
     polish : bool
         Let bounded least squares finish the fit of the swarm.
     max_order : int

@@ -6,8 +6,8 @@ Fit the unknown memory of labelled runs that do not start at the lowest voltage.
 
 A play may stand still at an unknown output until the voltage has moved by its threshold.  A
 free-run fit varies the outputs at the start and the weights together.  A run is thinned to the
-extremes and the last sample of each block, because extremes alone decide the play outputs; the
-displacement counts at the last samples.  The fit begins at several guesses and keeps the best.
+extremes and the last sample of each block, because extremes decide the play outputs.  The fit
+compares the displacement at the last samples.  It begins at several guesses and keeps the best.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 Rule = Callable[[Array], Array]
 
-#: number of blocks into which a run is thinned, to choose a guess and to fit the memory; each
-#: block keeps its extremes and its last sample
+#: number of blocks into which a run is thinned: to choose a guess, and to fit the memory
 ROUGH, BLOCKS = 500, 2000
 #: number of plays of the temporary H, and of the blocks of a run in the fit (both taste)
 PLAYS, FIT_BLOCKS = 40, 50

@@ -6,8 +6,8 @@ Step 1: find the pure delay from steps, and check it by a scan of the ARX loss.
 
 The step responses are divided by the signed height of their steps and averaged.  The delay is the
 first of two samples at which the average exceeds five standard deviations of its noise.  The scan
-fits ARX models with each delay to the steps, else to the noise, and takes the largest delay of
-about the least loss.  If steps and scan differ, or the scan fails, free runs over noise decide.
+fits ARX models to the steps, else to the noise, and takes the largest delay of about the least
+loss.  If steps and scan differ, or the scan fails, free runs over the noise decide.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ CHECK_ORDERS = (4, 8, 12)
 CHECK_DELAYS = (0, 2, 4, 6, 8, 10, 13, 16, 20, 25, 30)
 #: errors within this share of the smallest error count as equal to it
 SLACK = 0.05
-#: largest error of the best free run, as a share of the motion, at which the free run may decide
-#: the delay if steps and scan both fail
+#: largest error of the best free run, as a share of the motion.  Up to this error the free run may
+#: decide if steps and scan both fail
 FOLLOWS = 0.5
 
 Signals = tuple[Array, Array]
@@ -236,7 +236,7 @@ def delay_from_loss(loss: Array) -> int | None:
 
     A model with too small a delay contains the true model if it has enough numerator
     coefficients.  The loss for d = 0, 1, ... therefore stays low up to the true delay and rises
-    behind it.  If the loss has not risen at the largest delay, the result is None.
+    behind it.  The result is None if the loss is still low at the largest delay.
 
     Examples
     --------
@@ -257,10 +257,10 @@ def checked_delay(result: DelayResult, fitted: Signals, held: Signals) -> DelayR
 
     - The delay of steps or scan holds: choose it, and the smaller delay if both hold.
     - The delays of steps and scan fail: choose half of the largest delay that holds.
-    - Steps and scan tell no delay (source 'none'): keep the result if the largest delay holds and
-      the delay 0 fails, because the true delay may be larger.  Also keep it if the largest delay
-      holds but the best free run errs by more than `FOLLOWS` of the motion.  Otherwise choose half
-      of the largest delay that holds.
+    - Steps and scan fail to give a delay (source 'none'): keep the result if the largest delay
+      holds and the delay 0 fails, as the true delay may be larger.  Also keep it if the largest
+      delay holds, and the best free run errs by more than `FOLLOWS` of the motion.  Otherwise
+      choose half of the largest delay that holds.
 
     `fitted` holds input and output of noise.  The noise right behind it, `held`, gives the errors.
     """

@@ -4,10 +4,10 @@
 """
 Step 3: choose the law of H and its thresholds by data that were not fitted.
 
-The data are cut into eight parts, and each part is predicted from all other parts.  A wider
-law must lower the geometric mean of their rms errors by `WORTH`, even with one standard error
-added, and is then checked on small motion.  Else H stays a sum of plays, and its thresholds become
-finer while held-out blocks err less.  The error of the fit itself would prefer too wide laws.
+Each of eight parts of the data is predicted from all other parts.  A wider law must lower the
+geometric mean of the rms errors by `WORTH`, even with one standard error added.  Small motion may
+reject this law.  Otherwise H is a sum of plays, with finer thresholds as long as held-out blocks
+err less.  The error of the fit itself would prefer laws that are too wide.
 """
 
 from __future__ import annotations

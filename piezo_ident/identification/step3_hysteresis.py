@@ -43,7 +43,7 @@ WEIGHT_BOX, P1_BOX, P2_BOX = (0.0, 2.0), (-2.0, 2.0), (-2.0, 4.0)
 STILL = 1e-8
 #: weight that pulls lags along the path to zero, as a share of the size of the linear term
 PULL = 0.01
-#: share of the transient of G from the first simulated sample that is left at the first used one
+#: share of the transient of G that is left at the first used sample
 FORGOTTEN = 1e-13
 
 

@@ -4,8 +4,8 @@
 """
 The three steps on labelled records: delay from steps, G from noise, H from a triangle.
 
-H is fitted last.  Free runs over held-out samples then choose between a sum of plays and a wider
-law from all motion, with and without pairs of slow poles and zeros, and with and without G.
+H is fitted last.  The squared free-run error on held-out samples then decides whether a law fitted
+to all motion replaces plays, whether pairs of slow poles and zeros stay in G, and whether G stays.
 """
 
 from __future__ import annotations

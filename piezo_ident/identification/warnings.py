@@ -217,9 +217,9 @@ def warn_of_shape(predictions: Sequence[Prediction], scaling: Scaling) -> list[s
     """
     Warn of a measured loop whose shape no H of this package has.
 
-    The branches of H rise.  Less than half of the variance of its loop is therefore even, that is,
-    the same for a rise of the voltage from the middle as for a fall.  Loops of plays are widest in
-    the middle.
+    The branches of H rise.  The even part of its loop, the same for a rise of the voltage from the
+    middle as for a fall, therefore has less than half of the variance.  Loops of plays are widest
+    in the middle.
     """
     measured = _branches(predictions, [p.run.piece.y / scaling.Y for p in predictions])
     modelled = _branches(predictions, [p.y_hat / scaling.Y for p in predictions])
