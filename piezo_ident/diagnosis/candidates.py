@@ -106,8 +106,8 @@ class CandidateSearch:
 
     def _with_all_treatments(self, candidates: Candidates, size: int) -> Candidates:
         """Fit the best sets of a size with all treatments of H and G."""
-        # a wide H may have absorbed an effect in part and errs under other motion; a sum of plays
-        # may leave an error that another effect fits by accident
+        # a wide H may have absorbed an effect in part, and errs under other motion.  A sum of
+        # plays may leave an error that another effect fits by accident
         bests = [c for c in candidates.bests if len(c.effects) == size][:IN_ALL_WAYS]
         for best in bests:
             # a treatment with a larger error than the best treatment does not count

@@ -55,8 +55,8 @@ class FittedSet:
     """
     A set of effects beside one treatment of H and G, fitted.
 
-    The effects are sorted, without the effects that have tests of their own.  The way is the
-    treatment of H: 'given', 'plays' or 'wide'; for the refined model also 'drawn' (wide, towards
+    The effects are sorted, without the effects that have tests of their own.  `way` is the
+    treatment of H: 'given', 'plays' or 'wide'.  The refined model also has 'drawn' (wide, towards
     the given H) or 'gain' (the given H times `gain`).  `found_in` is the search that found the
     candidate.
     """

@@ -267,8 +267,8 @@ def toward_given(
     """
     Repeat a fit of rows without labelled kinds of motion, drawn to the given H.
 
-    Rows without labels do not test a refitted H under other motion.  The given H was identified on
-    other motion, so it counts as data, too:
+    Only labelled rows test a refitted H under other motion.  The given H was identified on other
+    motion, so it counts as data, too:
 
         min  |e|^2 + n mean((h - h_0 - c)^2)
 

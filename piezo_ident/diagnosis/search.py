@@ -50,8 +50,8 @@ STARTS, FIRST, FINAL = 2, 3, 2
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
-#: a fit ends after a step that gains less than this share of the mean square of the noise, or of
-#: the smallest effect if that is smaller
+#: a fit ends after a step that gains less than this share of the smaller of two mean squares: of
+#: the noise, and of the smallest effect
 OF_LEAST = 0.01
 #: meaningless difference, rms in % of stroke: weights of H describe no stage more exactly
 INDISTINCT = 0.01

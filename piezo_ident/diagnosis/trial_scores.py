@@ -14,9 +14,9 @@ stays constant.  There the effect must have the size that was fitted to all data
 
     kappa = 1 + <c, e> / <c, c>
 
-measures this.  Here c is the contribution of the effect and e is the residual with the effect in
+measures this size.  c is the contribution of the effect, and e is the residual with the effect in
 the model.  Terms that may differ between rests, or between motions, are projected out of c and e.
-kappa is 1 for the right effect, and any number for a wrong effect.
+kappa must lie within `SHOWS`: it is 1 for the right effect, and any number for a wrong effect.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class TrialColumns:
         self.simulator, self.rows = simulator, simulator.rows
         self._state = state
         self._view = _view_of(simulator, lines)
-        #: for each effect: its trials that can run, with the places of their settings, and the
+        #: for each effect, its trials that can run, with the places of their settings; then the
         #: change of the rows for each setting, in single precision to save memory
         self._kept: dict[str, tuple[list[tuple[Trial, list[int]]], NDArray[np.float32]]] = {}
 

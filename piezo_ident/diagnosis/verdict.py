@@ -233,7 +233,7 @@ def smallest_detectable(candidates: Candidates, findings: Findings) -> float | N
     """
     Return the smallest size of a further effect that would be found, rms in % of stroke.
 
-    A voltage that passes its range too rarely shows no effect: the result is then None.
+    The result is None if the voltage passes its range too rarely.
     """
     if candidates.rows.passes < PASSES:
         return None

@@ -8,9 +8,9 @@ The scale of the error is
 
     q^2 = c_0^2 + (c_S S)^2 + (c_D D)^2 + (c_N N)^2,
 
-in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  The other kinds
-give q on kind k of K kinds of motion, and r_k^2 is the mean square of error over q.  A new kind
-has each r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and
+in spans, with swing S, speed D and nesting N of `piezo_ident.uncertainty.motion`.  On kind k of K
+kinds of motion q is fitted to the others, and r_k^2 is the mean square of error over q.  A new
+kind has each r_k with equal probability, and normal errors: pooling of R. Dunn, L. Wasserman and
 A. Ramdas, J. Am. Stat. Assoc. 118(544), 2023, doi:10.1080/01621459.2022.2060112.  The half width
 at level p is q lambda sqrt(1 + 1/K), where lambda solves
 
