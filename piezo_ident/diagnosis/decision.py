@@ -19,8 +19,8 @@ G, and the last effect must gain more than chance.  The set that leaves least is
 with fewer parameters within `ALIKE`.  Sets of its size within `RIVALS` form a class with it.
 
 A wide H imitates an effect of the path of the voltage.  If no set is admissible in labelled
-records, it is taken if its gain beside the given H is ``1 - TAKES`` of the gain of a refit.
-It has then set in since the identification.
+records, such an effect may be taken beside the given H.  Its gain must reach ``1 - TAKES`` of the
+gain of the best refit.  The effect has then set in since the identification.
 """
 
 from __future__ import annotations

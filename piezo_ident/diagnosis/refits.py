@@ -6,7 +6,7 @@ Refit H, and choose the H of the refined model.
 
 The walk tries the given H, then plays, a retuned G, wide laws, and a wide law with a retuned G.
 A step is taken if it leaves at most `TAKES` of the error on whole kinds of motion.  Interleaved
-blocks alone would choose a wide H with a retuned G that errs widely under other motion.
+blocks could choose a wide H with a retuned G that errs widely under other motion.
 """
 
 from __future__ import annotations

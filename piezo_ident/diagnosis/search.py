@@ -5,7 +5,7 @@
 Run one round of the search: add each candidate effect in turn to one fit.
 
 Linear trials (`trial_scores`) score the effects on held-out blocks.  The best `JOINT_FITS` effects
-and look-alikes of the best are fitted jointly with H: each for `FIRST` iterations, then the best.
+and look-alikes of the best are fitted jointly with H, for `FIRST` iterations.  The best go on.
 """
 
 from __future__ import annotations
