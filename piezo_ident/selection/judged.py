@@ -90,6 +90,6 @@ class Promise:
         if self.other is None:
             return (
                 f'{self.same:.3g} % of stroke on such motion; the error on another kind of motion '
-                'is unknown, as no other kind was held out: play `identification_loops`'
+                'is not known until another kind is held out: play `identification_loops`'
             )
         return f'{self.same:.3g} % of stroke, {self.other:.3g} % on another kind of motion'
