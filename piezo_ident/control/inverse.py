@@ -53,7 +53,7 @@ PASSES = 30
 EXACT = 1e-5
 #: a pass that leaves more than this share of the error halves the step, or ends the iteration if
 #: the error is below `MATTERS`
-WORTH = 0.9
+PASS_LEAVES = 0.9
 #: the iteration ends when the share of a step falls below
 SHORTEST = 0.2
 #: A larger error than `MATTERS`, as a share of the span of the motion, counts as a miss.  A span
@@ -313,7 +313,7 @@ def _iterate(task: _Task) -> tuple[_Pass, int]:
             counts = within if within.any() else counts
         passes += 1
         rms = float(np.sqrt(np.mean(now.error[counts] ** 2))) / task.span
-        falls_enough = rms < WORTH * least
+        falls_enough = rms < PASS_LEAVES * least
         if rms < least:
             least, best = rms, now
         if rms < EXACT:

@@ -36,7 +36,7 @@ from piezo_ident.record.readings.faults import MAX_WILD
 from piezo_ident.record.readings.jumps import least_step, wild_readings
 
 #: learning goes on while a run leaves at most this share of the error
-WORTH = 0.95
+RUN_LEAVES = 0.95
 #: smallest step that is tried after a worse run
 SMALLEST = 0.2
 #: lowest correlation of measured and predicted displacement at which they count as one stage
@@ -158,11 +158,11 @@ class Learning:
     def is_done(self) -> bool:
         """Whether the error has stopped falling."""
         errors, shapes = [r.error for r in self.repetitions], self._shapes
-        if len(errors) < 2 or errors[-1] <= WORTH * min(errors[:-1]):
+        if len(errors) < 2 or errors[-1] <= RUN_LEAVES * min(errors[:-1]):
             return False
-        harms = errors[-1] > min(errors[:-1]) / WORTH
+        harms = errors[-1] > min(errors[:-1]) / RUN_LEAVES
         # after a worse run a smaller step may help; a moving mean does not end learning
-        falls = shapes[-1] <= WORTH * min(shapes[:-1]) and shapes[-1] > 0.0
+        falls = shapes[-1] <= RUN_LEAVES * min(shapes[:-1]) and shapes[-1] > 0.0
         return not (harms or falls) or self._step < SMALLEST
 
     def take(self, measured: ArrayLike) -> float:

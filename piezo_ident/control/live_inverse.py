@@ -42,7 +42,7 @@ PREVIEW = 400
 #: most passes
 MOST_PASSES = 4
 #: a further pass must leave at most this share of the error
-WORTH = 0.7
+PASS_LEAVES = 0.7
 #: duration of the transition from another voltage [samples]; taste
 JOIN = 2000
 #: error of the trial above which a warning calls the preview short [% of stroke]
@@ -177,7 +177,7 @@ class LiveInverse:
             self.reset()
             v = self.process(np.append(wanted, np.full(self.preview, wanted[-1]))).v
             error = percent_of_stroke(wanted, self.model.stream().process(v)[self.preview :])
-            if not error < WORTH * least:
+            if not error < PASS_LEAVES * least:
                 break
             best, least = passes, error
         return best, least

@@ -32,7 +32,7 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 #: most passes, and corner of the smoothing of the speed in cutoffs of the effect
 PASSES, SMOOTH = 4, 0.5
 #: passes go on while one leaves at most this share of the squared error
-WORTH = 0.7
+PASS_LEAVES = 0.7
 #: largest rms error of the passes without Gauss-Newton steps [of the span of the motion]
 SETTLED = 1e-4
 #: Gauss-Newton steps for a new motion, and for a motion similar to the one before
@@ -135,7 +135,7 @@ class RateInverse:
             left, before = self._left(u, w), best[0]
             if left < before:
                 best = left, u, reached
-            if not left < WORTH * before:
+            if not left < PASS_LEAVES * before:
                 break
         return best
 

@@ -53,7 +53,7 @@ LEFT = 'structure that the shared modes do not account for'
 LAWS = ('linear', 'plays in front', 'plays', 'softening', 'softening and plays')
 IN_FRONT = LAWS[:2]
 #: a law is preferred to simpler ones if it takes this share of their error (taste)
-WORTH = 0.1
+LAW_GAIN = 0.1
 #: standard deviation of a normal variable in medians of its size
 NORMAL = 1.4826
 #: number of records of a group to which laws are fitted, the largest weights first (taste: time)
@@ -173,7 +173,7 @@ def _found(
         return None
     fitted = search.laws()
     errors |= {law: search.error(dict.fromkeys(search.groups, x)) for law, x in fitted.items()}
-    limit = min(errors[law] for law in LAWS) / (1 - WORTH)
+    limit = min(errors[law] for law in LAWS) / (1 - LAW_GAIN)
     law = next(law for law in LAWS if errors[law] <= limit)
     if law in IN_FRONT or not _beats(errors[law], errors['chains']):
         return None
@@ -291,7 +291,7 @@ class LawSearch:
             kept[group] = loop_fit(self.linear, part, hold=('poles',), iterations=STEPS)
             own[group] = loop_fit(kept[group], part, iterations=STEPS)
         self._progress('shared modes', 0.3)
-        return self.error(own) < (1 - WORTH) * self.error(kept)
+        return self.error(own) < (1 - LAW_GAIN) * self.error(kept)
 
     def laws(self) -> dict[str, SharedModes]:
         """Fit every law."""

@@ -44,10 +44,10 @@ FINE, PARTS = 40, 8
 #: share by which a wider law must lower the error of the parts.  Wrong laws lowered the error by
 #: up to 17 % (on loops of Bouc-Wen and Duhem models).  The right law lowered it by 60 to 95 % (on
 #: Preisach loops)
-WORTH = 0.25
+LAW_GAIN = 0.25
 #: largest error of a wider law on small motion, relative to the error of plays.  For a law with
-#: lags along the path, the limit is 1 - `WORTH` instead.  The error of this law was 6 to 27 % on
-#: its own kinds of loops, and 84 % under creep
+#: lags along the path, the limit is 1 - `LAW_GAIN` instead.  The error of this law was 6 to 27 %
+#: on its own kinds of loops, and 84 % under creep
 NO_WORSE = 1.1
 
 
@@ -207,7 +207,7 @@ def choose_law(
     # the columns of all laws together, with free weights, are a lower bound for every law
     least = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=1e-10)[0]
     floor = float(np.sum((whole[:, :-1] @ least - whole[:, -1]) ** 2))
-    if len(parts) < PARTS or floor > (1.0 - WORTH) ** 2 * fitted(whole, law_of['plays']).loss:
+    if len(parts) < PARTS or floor > (1.0 - LAW_GAIN) ** 2 * fitted(whole, law_of['plays']).loss:
         return Choice(None)
     losses: dict[str, Array] = {}
     for i, (name, law) in enumerate(law_of.items()):
@@ -220,7 +220,7 @@ def choose_law(
     better = [
         name
         for name in LAWS[1:]
-        if _upper(logs[name] - logs['plays']) < np.log(1.0 - WORTH)
+        if _upper(logs[name] - logs['plays']) < np.log(1.0 - LAW_GAIN)
         and fitted(whole, law_of[name]).hysteresis.lowest_slope() > 0
     ]
     for excerpt in others if better else ():
@@ -234,13 +234,14 @@ def choose_law(
         better = [
             name
             for name in better
-            if left[name] <= (1.0 - WORTH if law_of[name].lags else NO_WORSE) ** 2 * left['plays']
+            if left[name]
+            <= (1.0 - LAW_GAIN if law_of[name].lags else NO_WORSE) ** 2 * left['plays']
         ]
     if not better:
         return Choice(None, errors)
     best = min(better, key=errors.__getitem__)
     chosen = next(
-        name for name in better if np.mean(logs[best] - logs[name]) >= np.log(1.0 - WORTH)
+        name for name in better if np.mean(logs[best] - logs[name]) >= np.log(1.0 - LAW_GAIN)
     )
     return Choice(law_of[chosen], errors)
 

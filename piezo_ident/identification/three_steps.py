@@ -33,7 +33,7 @@ from piezo_ident.identification.step2_dynamics import (
     second_step,
     without_pairs,
 )
-from piezo_ident.identification.step3_choice import Means, third_step, WORTH
+from piezo_ident.identification.step3_choice import LAW_GAIN, Means, third_step
 from piezo_ident.identification.step3_hysteresis import fit_again, HysteresisFit
 from piezo_ident.identification.warnings import warn_of_delay, warn_of_thresholds, warn_of_triangle
 from piezo_ident.model.scaling import Scaling
@@ -127,7 +127,7 @@ class _LabelledFitter:
             motion = [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
             other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
             left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
-            if other.law != 'plays' and left < (1.0 - WORTH) ** 2 * squares_left(model, runs):
+            if other.law != 'plays' and left < (1.0 - LAW_GAIN) ** 2 * squares_left(model, runs):
                 hysteresis, fitted_to = other, motion
         if hysteresis.law != 'plays':
             # G was found with plays

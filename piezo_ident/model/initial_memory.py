@@ -80,7 +80,7 @@ EARLY = 0.2
 #: creep that a model lacks also shows early, but less)
 ERRS, SEEN, LEAVES = 5.0, 1e-3, 0.2
 #: largest rms error with creep of earlier motion and a free zero, over the rms error without both
-WORTH = 0.9
+CREEP_LEAVES = 0.9
 #: reduction of the rms error that creep must bring beyond this, in spans
 FAINT = 1e-5
 #: largest rms error with creep and the zero of the model, over the rms error with a free zero
@@ -213,7 +213,7 @@ def fit_start(model: StageModel, piece: Piece, sound: Mask | None = None) -> Sta
     if not creeps:
         return still
     free, left = _fit(model, piece, sound, memory=not known, creep=True, zero=True)
-    if np.std(left) > WORTH * np.std(e) - FAINT:
+    if np.std(left) > CREEP_LEAVES * np.std(e) - FAINT:
         return None if known else still
     held, e_held = _fit(model, piece, sound, memory=not known, creep=True)
     if np.sqrt(np.mean(e_held**2)) <= SURE * np.std(left):

@@ -27,7 +27,13 @@ from piezo_ident.control.axes.axes_inverse import AxesFilter, inverse_filters, s
 from piezo_ident.control.axes.modes_inverse import equivalent, Limited, signal_gains
 from piezo_ident.control.inputs import checked_limits, SHORT
 from piezo_ident.control.linear_inverse import least_gain
-from piezo_ident.control.live_inverse import Driven, PREVIEW, preview_warnings, trial_motion, WORTH
+from piezo_ident.control.live_inverse import (
+    Driven,
+    PASS_LEAVES,
+    PREVIEW,
+    preview_warnings,
+    trial_motion,
+)
 from piezo_ident.model.metrics import percent_of_stroke
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.modes.stream import ModesRun, ModesStream
@@ -144,7 +150,7 @@ class LiveModesInverse:
             for passes in range(1, min(MOST_PASSES, self.preview) + 1):
                 error = self._missed(self._built(Q, passes, np.inf), wanted)
                 tried.append((error, Q, passes))
-                if not error < WORTH * before:
+                if not error < PASS_LEAVES * before:
                     break
                 before = error
         best = min(tried, key=lambda one: one[0])

@@ -25,7 +25,7 @@ from piezo_ident.model.modes.modal import Modal, narrowest, RADIUS, resolved
 from piezo_ident.model.modes.shared_modes import SharedModes
 
 #: a higher order has to lower the held-out error by this part of it
-WORTH = 0.02
+ORDER_GAIN = 0.02
 #: every so many lines serve the choice of the order
 THIN = 3
 #: steps of each order that is tried
@@ -109,7 +109,7 @@ def choose_order(
     Returns
     -------
     Modal
-        The lowest order with an error within `WORTH` of the least error.
+        The lowest order with an error within `ORDER_GAIN` of the least error.
     dict
         Error in % of each order that was tried.
     """
@@ -129,7 +129,7 @@ def choose_order(
     if not found:
         raise IdentificationError(f'{len(response.lines)} lines determine none of {orders}')
     best = min(errors.values())
-    order = min(o for o, e in errors.items() if e <= best * (1 + WORTH))
+    order = min(o for o, e in errors.items() if e <= best * (1 + ORDER_GAIN))
     return refined(found[order], response, iterations=20), errors
 
 
