@@ -21,6 +21,10 @@ from piezo_ident.effects.rate_dependent_hysteresis import AMPLITUDES, RateDepend
 from piezo_ident.operators.kernels import curve_slope
 from scipy.sparse.linalg import LinearOperator
 
+#: edges and weights of the plays, slopes of their lower and upper edges by the power of the speed,
+#: slope of the remaining line, slope of the power, pole and gain of the low-pass of the speed
+Parts = tuple[NDArray[np.int8], Array, Array, Array, Array, Array, float, float]
+
 
 def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOperator:
     """
@@ -44,7 +48,7 @@ def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOpera
 
     def product(kernel: Callable[..., None], x: Array) -> Array:
         out = np.zeros(u.size)
-        kernel(np.ascontiguousarray(x.ravel()), *parts, out)
+        kernel(np.ascontiguousarray(x.ravel()), parts, out)
         return out
 
     products = partial(product, _forward), partial(product, _transposed)
@@ -82,18 +86,8 @@ def _edges(
 
 
 @ordered_kernel
-def _forward(
-    x: Array,
-    edge: NDArray[np.int8],
-    weight: Array,
-    lower: Array,
-    upper: Array,
-    line: Array,
-    slope: Array,
-    pole: float,
-    gain: float,
-    out: Array,
-) -> None:
+def _forward(x: Array, parts: Parts, out: Array) -> None:
+    edge, weight, lower, upper, line, slope, pole, gain = parts
     plays, speed, last = np.zeros(lower.size), 0.0, 0.0
     for k in range(x.size):
         speed = pole * speed + gain * (x[k] - last)
@@ -110,18 +104,8 @@ def _forward(
 
 
 @ordered_kernel
-def _transposed(
-    x: Array,
-    edge: NDArray[np.int8],
-    weight: Array,
-    lower: Array,
-    upper: Array,
-    line: Array,
-    slope: Array,
-    pole: float,
-    gain: float,
-    out: Array,
-) -> None:
+def _transposed(x: Array, parts: Parts, out: Array) -> None:
+    edge, weight, lower, upper, line, slope, pole, gain = parts
     plays, speed = np.zeros(lower.size), 0.0
     for k in range(x.size - 1, -1, -1):
         power, v = 0.0, line[k] * x[k]
