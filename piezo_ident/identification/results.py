@@ -17,7 +17,7 @@ from piezo_ident.identification.step1_delay import DelayResult
 from piezo_ident.identification.step2_dynamics import DynamicsResult
 from piezo_ident.identification.step3_hysteresis import HysteresisFit
 from piezo_ident.model.free_run import piece_runs, PieceRun
-from piezo_ident.model.front_door import ModelParameter
+from piezo_ident.model.front_door import Parameters
 from piezo_ident.model.metrics import KINDS
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import StartLike
@@ -214,8 +214,8 @@ class Identification(Showable):
         return piece_runs(self.model, self.records, self.memories)
 
     @property
-    def parameters(self) -> tuple[ModelParameter, ...]:
-        """All parameters of the model with their standard deviations."""
+    def parameters(self) -> Parameters:
+        """All parameters of the model with their standard deviations, printed as a table."""
         return self.model.parameters
 
     def error(self, data: str) -> float:

@@ -60,6 +60,26 @@ class ModelParameter:
         return self.std < abs(self.value)
 
 
+class Parameters(tuple[ModelParameter, ...]):
+    """Parameters of a model; a prompt shows them as one table."""
+
+    def __repr__(self) -> str:
+        import piezo_ident as pi
+
+        number = pi.report.number
+        rows = [
+            (
+                *(p.part, p.name),
+                p.value if isinstance(p.value, str) else number(p.value, 4),
+                *(number(p.std, 2), p.unit),
+            )
+            for p in self
+        ]
+        head = ('part', 'name', 'value', 'deviation', 'unit')
+        text: str = pi.report.plain_text([pi.report.Table('', head, rows)])
+        return text
+
+
 class Bode(NamedTuple):
     """Frequency [Hz], gain [m/V] and phase [deg], shape (n,) each."""
 
@@ -135,9 +155,9 @@ class FrontDoor:
         )
 
     @property
-    def parameters(self: Any) -> tuple[ModelParameter, ...]:
+    def parameters(self: Any) -> Parameters:
         """
-        List all parameters with their standard deviations, then `quantities`.
+        List all parameters with their standard deviations, then `quantities`; printed as a table.
 
         Examples
         --------
@@ -171,7 +191,7 @@ class FrontDoor:
                     own = f'{name}_{i}' if many else name
                     one = x if isinstance(x, str) else float(x)
                     rows.append(ModelParameter(setting.name, own, one, units[name]))
-        return (*rows, *self.quantities)
+        return Parameters((*rows, *self.quantities))
 
     def bode(self: Any, frequency: ArrayLike | None = None) -> Bode:
         """

@@ -35,7 +35,7 @@ _HOMES = {
     'json_data': ('json_text', 'steps_to_json', 'to_json'),
     'picture': ('model_text', 'plot', 'save_plot', 'to_html', 'to_text'),
     'refined': ('validated',),
-    'table': ('length',),
+    'table': ('length', 'number', 'plain_text', 'Table'),
 }
 __all__ = [name for names in _HOMES.values() for name in names]
 

@@ -56,6 +56,17 @@ def test_deviations_are_those_of_the_identification_and_none_of_another_length()
     assert std['H', 'p2'] is None and std['G', 'a_1'] is None
 
 
+def test_parameters_are_printed_as_one_table():
+    known = {'p1': 2e-3}
+    model = replace(PAPER, effects=(CREEP,), identification={'uncertainties': known})
+    head, *lines = repr(model.parameters).splitlines()
+    assert head.split() == ['part', 'name', 'value', 'deviation', 'unit']
+    rows = {tuple(line.split()[:2]): line.split()[2:] for line in lines}
+    assert list(rows) == [(p.part, p.name) for p in model.parameters]
+    assert rows['H', 'p1'] == [f'{PAPER.hysteresis.p1:.4f}', '0.0020']
+    assert rows['creep', 'time_constant_2'] == ['10.00', '–', 's']
+
+
 def test_the_result_of_an_identification_lists_the_same_parameters():
     v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
     result = pi.identify(
