@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 import os
@@ -20,7 +20,7 @@ from piezo_ident.effects import find_effect
 
 if TYPE_CHECKING:
     from control import TransferFunction
-    from piezo_ident import FreeRun, Inverse
+    from piezo_ident import EachAxis, FreeRun, Inverse, MultiAxisInverse
     from piezo_ident.model.free_run import FreeRunErrors
     from piezo_ident.record.record import Record
 
@@ -287,6 +287,41 @@ class FrontDoor:
         from piezo_ident.model.files import model_to_yaml
 
         write_text(path, model_to_yaml(self))
+
+
+class AxesFrontDoor:
+    """Base class of `MultiAxisModel`: predict, score and invert all axes together."""
+
+    def predict(self: Any, record: Record, interval: float | None = None) -> EachAxis[FreeRun]:
+        """Predict a measured record in free run, as `piezo_ident.free_run`."""
+        from piezo_ident import free_run
+
+        runs: EachAxis[FreeRun] = free_run(self, record, interval)
+        return runs
+
+    def score(self: Any, record: Record) -> dict[str, FreeRunErrors]:
+        """
+        Rate the free run of each axis on a measured record, as `StageModel.score`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import piezo_ident as pi
+        >>> one = pi.SimulatedStage.load('paper').model
+        >>> stage = pi.MultiAxisModel({'y': one, 'y_b': one})
+        >>> v = 5 - 5 * np.cos(np.arange(4000) / 100)
+        >>> y, second = stage.simulate({'v': v, 'v_b': v})['y'], {'v_b': v, 'y_b': one.simulate(v)}
+        >>> record = pi.Record.from_arrays(v, y, sample_rate=20e3, channels=second)
+        >>> {axis: errors.percent < 1e-6 for axis, errors in stage.score(record).items()}
+        {'y': True, 'y_b': True}
+        """
+        return {a: run.errors_after_start or run.errors for a, run in self.predict(record).items()}
+
+    def inverse(self: Any, wanted: Mapping[str, ArrayLike], **options: Any) -> MultiAxisInverse:
+        """Find the voltages that move the axes as wanted, as `piezo_ident.invert`."""
+        from piezo_ident import invert
+
+        return invert(self, wanted, **options)
 
 
 def _line(model: Any) -> float:

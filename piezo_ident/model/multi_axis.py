@@ -30,6 +30,7 @@ from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.common.files import write_text
 from piezo_ident.model.axis_records import axis_record, columns_of, MOTION, motion_of, voltage_of
 from piezo_ident.model.free_run import free_run, predict
+from piezo_ident.model.front_door import AxesFrontDoor
 from piezo_ident.model.modes.shared_modes import SharedModes
 from piezo_ident.model.stage_model import EffectSetting, StageModel, warn_of_unused
 from piezo_ident.record.record import Piece, Record
@@ -111,7 +112,7 @@ class EachAxis(Mapping[str, T], Generic[T]):
 
 
 @dataclass(frozen=True, eq=False)
-class MultiAxisModel:
+class MultiAxisModel(AxesFrontDoor):
     """
     Model of a stage of several axes: a model for each axis, with the paths among its effects.
 

@@ -70,10 +70,12 @@ def test_each_path_is_named_with_its_source_and_size_and_predicts_a_raster(diagn
         gain = effect.parameters['gain'].value * diagnosed[axis].model.scaling.Y
         assert gain == pytest.approx(share, rel=0.02)
     record = play(*raster(4000), seed=2)
-    before, after = (pi.free_run(m, record) for m in (one_by_one.model, diagnosed.model))
+    before, after = (m.predict(record) for m in (one_by_one.model, diagnosed.model))
+    score = diagnosed.model.score(record)
     for axis in ('y', 'y_b'):
         assert before[axis].errors.percent > 0.3
         assert after[axis].errors.percent < 0.1
+        assert score[axis] == (after[axis].errors_after_start or after[axis].errors)
 
 
 def test_an_axis_that_never_moves_is_left_out_and_told():
@@ -99,7 +101,7 @@ def test_all_axes_are_inverted_together():
         'y': 25e-6 * (1 - 0.8 * np.cos(2 * np.pi * 2 * t)),
         'y_b': 15e-6 * (1 - 0.8 * np.cos(2 * np.pi * 0.5 * t)),
     }
-    drive = pi.invert(stage, wanted)
+    drive = stage.inverse(wanted)
     assert set(drive.voltages) == {'v', 'v_b'}
     y = stage.simulate(drive.voltages)
     for axis, goal in wanted.items():
