@@ -363,6 +363,12 @@ def test_the_page_has_a_row_for_each_name():
     assert all(imitated for _, _, imitated in rows)
 
 
+def test_the_readme_counts_the_names_and_has_two_screens():
+    readme = (Path(__file__).resolve().parents[3] / 'README.md').read_text(encoding='utf-8')
+    assert f'among {len(VISIBLE)} effects' in ' '.join(readme.split())
+    assert len(readme.splitlines()) <= 80
+
+
 def test_creep_is_tried_up_to_the_time_that_is_judged():
     for judged, longest in ((1.5, 1.5), (np.inf, 8.0)):
         view = View(FS, 0.0, 1.0, np.ones(5), 8.0, judged=judged)

@@ -3,10 +3,12 @@
 
 """A lab's own effect comes in as an entry point: the package in example_effect/ does it."""
 
+import ast
 import configparser
 import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -92,6 +94,14 @@ def test_an_installed_effect_is_in_the_catalogue_and_in_models(site, tmp_path):
     assert found['trials'] == [
         [{'gain': 0.0, 'stop': stop}, [['gain', None]], [0.01]] for stop in (0.5, 0.7, 0.9)
     ]
+
+
+def test_the_effect_has_as_many_lines_as_its_page_says():
+    tree = ast.parse((EXAMPLE / 'example_effect.py').read_text(encoding='utf-8'))
+    (effect,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    page = (ROOT / 'docs/effect.md').read_text(encoding='utf-8')
+    said = re.search(r'An effect is a class of (\d+) lines', page)
+    assert int(said[1]) == effect.end_lineno - effect.lineno + 1 <= 30
 
 
 @pytest.mark.parametrize(
