@@ -169,11 +169,11 @@ def test_simulate_takes_real_numbers_without_a_mask():
     v = np.ma.masked_greater(np.linspace(0, 10, 100), 5.0)
     with pytest.raises(DataError, match='finite numbers'):
         PAPER.simulate(v)
-    with pytest.raises(DataError, match='voltage: expected real numbers, got complex128'):
+    with pytest.raises(DataError, match=r'voltage: .* complex128'):
         PAPER.simulate(v.data + 1j)
-    with pytest.raises(DataError, match="channel 'heat': expected real numbers, got complex128"):
+    with pytest.raises(DataError, match=r"channel 'heat': .* complex128"):
         PAPER.simulate(v.data, channels={'heat': v.data + 1j})
-    with pytest.raises(DataError, match='channels: expected Mapping, got list'):
+    with pytest.raises(DataError, match=r'channels: .* list'):
         PAPER.simulate(v.data, channels=[v.data])
     assert np.array_equal(PAPER.simulate(v[:20]), PAPER.simulate(v.data[:20]))
 

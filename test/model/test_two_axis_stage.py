@@ -110,7 +110,7 @@ def test_numbers_that_no_stage_has_are_refused(key, value, said):
 def test_either_kind_of_stage_is_loaded_and_shapes_are_checked():
     assert isinstance(load_stage('paper'), SimulatedStage)
     assert load_stage('two_axes').axes == ('', 'b')
-    with pytest.raises(DataError, match='do not fit two axes'):
+    with pytest.raises(DataError, match=r'\(5,\).*\(n, 2\)'):
         response(STAGE, np.zeros(5))
 
 

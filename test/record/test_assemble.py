@@ -220,7 +220,7 @@ def test_lost_samples_and_gaps_show_among_stamps_that_scatter(by):
 
 
 def test_regular_losses_are_no_scatter_and_no_rates_are_made_of_jitter():
-    with pytest.raises(DataError, match='not uniformly sampled'):
+    with pytest.raises(DataError, match=r'\(250 .* 750 .*--rate 2251\.5'):
         read([np.delete(x, np.s_[::4]) for x in columns(1000, rate=3000.0)])
     # two rates, both with jitter
     first, late = scattered(5000, 0.2), scattered(5000, 0.2)
@@ -311,7 +311,7 @@ def test_displacement_units(unit, factor):
 
 def test_unknown_unit_is_refused():
     for unit in ('inch', '0um', '-3um', '10', '1e999um'):
-        with pytest.raises(DataError, match='use m, mm, um or nm, or what one of the file is'):
+        with pytest.raises(DataError, match=f"'{unit}'.* 10um"):
             read(columns(), displacement_unit=unit)
 
 
@@ -349,7 +349,7 @@ def test_segments_of_labels_follow_the_pieces():
     'segments', [(['a'], [0, 5]), (['a', 'b'], [5, 0]), (['a'], [201]), (['a'], [0.5])]
 )
 def test_bad_segments_are_refused(segments):
-    with pytest.raises(DataError, match='segments need one start for each name'):
+    with pytest.raises(DataError, match=r'data: .* 0 to 200'):
         assemble(*columns(), segments, name='data')
 
 

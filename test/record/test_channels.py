@@ -98,7 +98,7 @@ def test_two_columns_of_one_name_are_refused(tmp_path, extra, reason):
 def test_a_unit_is_no_axis(record, tmp_path):
     path = write_csv(tmp_path / 'r.csv', COLUMNS | {'y_um': 1e6 * COLUMNS['y']})
     assert [f.where for f in pi.read(path).faults] == ["'y_um'"]
-    with pytest.raises(DataError, match='mm is a unit'):
+    with pytest.raises(DataError, match=r'r\.csv: --columns y_mm: mm'):
         pi.read(path, columns={'y_mm': 'y_b'})
 
 

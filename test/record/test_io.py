@@ -5,6 +5,7 @@
 
 import itertools
 from pathlib import Path
+import re
 import zipfile
 
 from hypothesis import given, HealthCheck, Phase, settings
@@ -140,12 +141,12 @@ def test_losses_are_said(tmp_path):
 def test_what_cannot_be_written_is_refused(tmp_path):
     c = table()
     piece = Piece(c['v'], c['y'], 1000.0, segments=(Segment('a\nb', 0, 9),))
-    with pytest.raises(DataError, match='segment label'):
+    with pytest.raises(DataError, match=r"r\.csv: .*'a\\nb'"):
         pi.write(Record((piece,)), tmp_path / 'r.csv')
     piece = Piece(c['v'], c['y'], 1000.0, channels={'a b': c['v']})
-    with pytest.raises(DataError, match='channel name'):
+    with pytest.raises(DataError, match=r"r\.csv: .*'a b'"):
         pi.write(Record((piece,)), tmp_path / 'r.csv')
-    with pytest.raises(DataError, match='unknown format'):
+    with pytest.raises(DataError, match=r'r\.xls'):
         pi.write(record(), tmp_path / 'r.xls')
     assert not list(tmp_path.iterdir())
 
@@ -154,7 +155,7 @@ def test_what_cannot_be_written_is_refused(tmp_path):
 def test_outputs_are_kept_unless_asked_and_places_refused(tmp_path, name):
     path = tmp_path / name
     pi.write(record(), path, storage=storage(name))
-    with pytest.raises(DataError, match='exists already'):
+    with pytest.raises(DataError, match=re.escape(str(path))):
         pi.write(record(), path, storage=storage(name))
     pi.write(record(), path, storage=storage(name), overwrite=True)
     assert_equal(pi.read(path), record())
@@ -372,7 +373,7 @@ def test_an_unknown_option_is_refused_with_the_one_that_was_meant(option, cure):
 
 def test_a_model_is_no_record_to_write(tmp_path):
     model = pi.SimulatedStage.load('paper').model
-    with pytest.raises(DataError, match=r'expected Record, got StageModel; .* method save'):
+    with pytest.raises(DataError, match=r'Record.* StageModel.* save'):
         pi.write(model, tmp_path / 'model.yaml')
 
 

@@ -31,7 +31,7 @@ def test_arrays_are_checked_as_a_file_is():
     assert {f.name for f in record.faults} == {'not_finite', 'gap'}
     assert record.labels == ('noise',)
     assert list(record.pieces[0].channels) == ['heat']
-    with pytest.raises(DataError, match='displacement-unit'):
+    with pytest.raises(DataError, match=r'75 m, .*--displacement-unit 1um or 1nm'):
         Record.from_arrays(V, 1e6 * Y, sample_rate=RATE)
 
 

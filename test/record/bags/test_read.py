@@ -99,7 +99,7 @@ def test_a_displacement_of_another_clock_is_told_from_gaps(tmp_path):
         for s in pair
     ]
     messages = [(f'/{s.quantity}', s) for s in moved]
-    with pytest.raises(DataError, match=r'share only \d+ of \d+ time stamps; a displacement row'):
+    with pytest.raises(DataError, match=r'bag: voltage and displacement .*10 of 990'):
         read_bag(write(tmp_path / 'bag', messages))
 
 
@@ -144,7 +144,7 @@ def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
 
 def test_streams_that_never_meet_are_refused(tmp_path):
     pairs = [(v, Samples(y.t + 1e-4, y.values, '', y.quantity)) for v, y in blocks()]
-    with pytest.raises(DataError, match='share no time stamp'):
+    with pytest.raises(DataError, match='bag: voltage and displacement'):
         read_bag(write(tmp_path / 'bag', interleave(pairs)))
 
 
@@ -267,7 +267,7 @@ def test_a_file_that_somebody_compressed(tmp_path, name, monkeypatch):
             read_bag(packed)
     packed.write_bytes(b'')
     monkeypatch.setitem(sys.modules, 'zstandard', None)
-    with pytest.raises(DataError, match='pip install zstandard'):
+    with pytest.raises(DataError, match=f'{packed.name}.*pip install zstandard'):
         read_bag(packed)
 
 

@@ -188,7 +188,7 @@ def test_truncated_database(tmp_path):
 def test_recovery_without_the_package_mcap(tmp_path, monkeypatch):
     path = killed(tmp_path / 'bag')
     monkeypatch.setitem(sys.modules, 'mcap.stream_reader', None)
-    with pytest.raises(DataError, match='pip install mcap'):
+    with pytest.raises(DataError, match=r'bag\.mcap.*pip install mcap'):
         read_bag(path, recover=True)
 
 
@@ -229,7 +229,7 @@ def test_a_database_that_is_no_bag(tmp_path):
     database.close()
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag.db3').rename(tmp_path / 'bag' / 'bag.db3')
-    with pytest.raises(DataError, match='damaged or unfinished bag'):
+    with pytest.raises(DataError, match=r'bag\.db3'):
         read_bag(tmp_path / 'bag', recover=True)
 
 
@@ -267,7 +267,7 @@ def test_both_ways_of_reading_agree(tmp_path):
 
 def test_a_name_that_no_disk_takes_is_refused(tmp_path):
     with (
-        pytest.raises(DataError, match=r'cannot be read|does not exist'),
+        pytest.raises(DataError, match='x' * 300),
         opened_bag(tmp_path / ('x' * 300)),
     ):
         pass

@@ -35,7 +35,7 @@ def test_what_a_flush_uses_is_there(tmp_path, storage):
 
 def test_a_rosbags_that_cannot_flush_is_refused(tmp_path, monkeypatch):
     monkeypatch.delattr(storage_mcap.McapWriter, 'close_chunk')
-    with pytest.raises(DataError, match='version of rosbags'):
+    with pytest.raises(DataError, match=r'bag: .* rosbags .* setup.py'):
         BagWriter(tmp_path / 'bag')
 
 
@@ -105,7 +105,7 @@ def test_names_are_numbered(tmp_path):
         assert writer.file.name == f'{want}.mcap'
         writer.close()
     (tmp_path / 'file').write_text('')
-    with pytest.raises(DataError, match='cannot be written'):
+    with pytest.raises(DataError, match='file/bag'):
         BagWriter(tmp_path / 'file' / 'bag')
 
 
@@ -175,7 +175,7 @@ def test_a_part_that_cannot_be_made_leaves_those_before_it(tmp_path):
     writer.max_size = 1
     writer._path = tmp_path / 'file' / 'bag'
     writer.flush()
-    with pytest.raises(DataError, match='cannot be written'):
+    with pytest.raises(DataError, match='file/bag_1'):
         writer.write('/voltage', 10**12, b'')
     writer.abort()
     assert read_bag(tmp_path / 'bag').n == 2000
