@@ -80,13 +80,13 @@ def test_limits_are_never_left():
 
 def test_what_was_not_measured_is_refused():
     learning = pi.Learning(PAPER, RASTER)
-    with pytest.raises(DataError, match='nothing was measured'):
+    with pytest.raises(DataError, match='learning: '):
         _ = learning.best
     with pytest.raises(DataError, match='3 measured samples for 60'):
         learning.take([0.0, 1.0, 2.0])
     with pytest.raises(DataError, match='finite'):
         learning.take(np.full(learning.drive.v.size, np.nan))
-    with pytest.raises(DataError, match='measured: expected real numbers'):
+    with pytest.raises(DataError, match=r'measured: .*<U3'):
         learning.take('abc')
     for corner in (0.0, -5.0, np.nan):
         with pytest.raises(DataError, match='give one above zero'):

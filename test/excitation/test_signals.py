@@ -352,7 +352,7 @@ def test_limits_of_the_caller_only_narrow():
 
 def test_a_signal_with_voltages_of_its_own_is_not_scaled():
     p = program({'signal': 'triangle', 'preset': 'paper'})
-    with pytest.raises(ConfigError, match='paper cannot be scaled'):
+    with pytest.raises(ConfigError, match=r'preset: paper .* peaks, base and slope'):
         scaled(p, (0.0, 100.0), FS)
     # its own limits, and another rate
     other = parse_program(program_to_yaml(scaled(p, p.limits, FS / 2)))

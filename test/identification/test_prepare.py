@@ -43,11 +43,11 @@ def test_rate_with_the_most_travel_wins_and_rates_that_differ_by_rounding_are_on
 
 
 def test_a_voltage_that_never_moves_and_nothing_to_scale_are_refused():
-    with pytest.raises(IdentificationError, match='never moves'):
+    with pytest.raises(IdentificationError, match=r'mine: .*voltage'):
         common_rate([record(piece(np.full(100, 3.0)))])
-    with pytest.raises(IdentificationError, match='constant'):
+    with pytest.raises(IdentificationError, match='voltage'):
         scaling_of([piece(np.full(9, 2.0), np.arange(9.0))])
-    with pytest.raises(IdentificationError, match='displacement is constant'):
+    with pytest.raises(IdentificationError, match='displacement'):
         scaling_of([piece(RAMP, np.full(1001, 1e-6))])
 
 

@@ -105,7 +105,7 @@ def test_a_voltage_that_is_never_applied_is_refused(record):
         (k, Samples(s.t, s.values + (k == APPLIED), s.segment, s.quantity))
         for k, s in blocks_of(record)
     )
-    with pytest.raises(DataError, match='nowhere the commanded one'):
+    with pytest.raises(DataError, match='applied voltage'):
         capture_of(blocks).record()
 
 
@@ -204,10 +204,10 @@ def test_a_block_longer_than_the_limit_is_kept_until_the_next():
 
 
 def test_nothing_and_half_of_it_are_refused(record):
-    with pytest.raises(DataError, match='no voltage has been captured; start the excitation'):
+    with pytest.raises(DataError, match=r'voltage .*excitation'):
         Capture().record()
     only = [b for b in blocks_of(record) if b[0] == 'voltage']
-    with pytest.raises(DataError, match='no displacement has been captured; is the stage'):
+    with pytest.raises(DataError, match=r'displacement .*stage'):
         capture_of(only).record()
 
 
@@ -263,11 +263,11 @@ def test_too_much_missing_in_a_segment_is_refused(record):
     few = without(blocks_of(record), ('voltage', 20))
     refuse_incomplete(capture_of(few).record())
     many = without(blocks_of(record), *(('displacement', k) for k in range(60, 90)))
-    with pytest.raises(DataError, match=r'0\.15 s of 0\.35 s of the noise segments are missing'):
+    with pytest.raises(DataError, match=r'0\.15 s of 0\.35 s of the noise'):
         refuse_incomplete(capture_of(many).record())
     # between two segments nobody knows which of them it was
     edge = without(blocks_of(record), *(('displacement', k) for k in range(45, 55)))
-    with pytest.raises(DataError, match='of the step segments'):
+    with pytest.raises(DataError, match=r'0\.05 s of 0\.275 s of the step'):
         refuse_incomplete(capture_of(edge).record())
 
 
@@ -286,7 +286,7 @@ def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
     snapshot = capture_of(late).snapshot()
     refuse_incomplete(snapshot.record())
     assert snapshot.sent() == pytest.approx({'step': 0.25, 'noise': 0.35, 'triangle': 0.4})
-    with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step segments are missing'):
+    with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step'):
         refuse_incomplete(snapshot.record(), snapshot.sent())
 
 
