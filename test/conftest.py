@@ -23,7 +23,7 @@ SLOWEST = (
     'diagnosis/test_diagnose.py',
     'identification/test_identify.py',
     'identification/test_free_run_fit.py',
-    'diagnosis/test_two_effects.py',
+    'diagnosis/whole/test_two_effects.py',
     'benchmarks/test_diagnosis_study.py',
     'benchmarks/test_bouc_wen.py',
     'benchmarks/test_any_record.py',
