@@ -41,7 +41,7 @@ def test_every_name_has_a_home_and_a_type():
         for alias in node.names
     }
     assert typed == set(NAMES) == set(pi._HOMES)
-    assert set(NAMES) <= set(dir(pi))
+    assert dir(pi) == sorted(pi.__all__)
 
 
 def test_a_name_that_is_not_there():
