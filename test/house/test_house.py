@@ -278,6 +278,18 @@ def test_changelog_has_a_forthcoming_section():
     assert lines[lines.index('Forthcoming') + 1] == '-' * len('Forthcoming')
 
 
+def test_every_page_begins_with_what_it_is_for():
+    others = [
+        path.name
+        for path in sorted((ROOT / 'docs').glob('*.md'))
+        # pages that only list others have no prose
+        if (prose := [x for x in path.read_text(encoding='utf-8').splitlines() if x[:1].isalpha()])
+        and 'toctree' not in path.read_text(encoding='utf-8')
+        and not prose[0].startswith('This page ')
+    ]
+    assert others == []
+
+
 def test_no_file_names_a_package_registry():
     hosts = ['py' + 'pi.org', 'python' + 'hosted']
     found = [
