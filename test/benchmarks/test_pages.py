@@ -11,11 +11,12 @@ import re
 import any_record
 import numpy as np
 import pytest
+import study_diagnosis as study
 import study_tracking
 
 ROOT = Path(__file__).resolve().parents[2]
 
-#: the script of each page that has one text; the pages of `study_diagnosis` have two
+#: script of each page; `study_diagnosis` writes two
 SCRIPTS = {
     'any_record': 'any_record',
     'benchmarks': 'run_all',
@@ -70,6 +71,15 @@ def test_a_page_has_the_words_of_its_script(name):
     page = page_of(name)
     stale = [sentence for sentence in sentences(SCRIPTS[name]) if sentence not in page]
     assert stale == []
+
+
+@pytest.mark.parametrize(
+    ('name', 'sums'), [('diagnosis_study', True), ('diagnosis_study_foreign', False)]
+)
+def test_a_page_of_diagnoses_has_the_words_of_its_set(name, sums):
+    page = page_of(name)
+    for text in (*study.PURPOSES[sums], study.SUMS if sums else study.FAMILIES):
+        assert [part for part in re.split(r'\{\w+\}', flat(text)) if part not in page] == []
 
 
 def test_scripts_have_words():
