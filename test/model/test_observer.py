@@ -72,6 +72,28 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
+def duhem(model, v):
+    """Run the model with a loop beside H, by a first-order law of the path as of Duhem."""
+    way = np.diff(model.scaling.u(v), prepend=model.scaling.u(v[0]))
+    z = np.zeros(v.size)
+    for k in range(1, v.size):
+        z[k] = z[k - 1] + 8.0 * (way[k] - z[k - 1] * abs(way[k]))
+    return model.simulate(v) + 2e-3 * SPAN * z
+
+
+def log_creep(model, v, hold=0.0):
+    """Run a stage that goes on by gamma s log10(1 + t / t0) after a step by s."""
+    n, gamma, t0 = v.size, 0.03, 0.05
+    t = np.arange(n) / model.sample_rate
+    base = model.without_dynamics().simulate(v)
+    law = gamma * np.log10(1.0 + t / t0)
+    # the stage was at 10 V for some seconds, and came down again, before the stream
+    creep = 0.9 * SPAN * (gamma * np.log10(1.0 + (t + hold) / t0) - law)
+    steps = np.diff(base, prepend=base[0])
+    crept = np.fft.irfft(np.fft.rfft(steps, 2 * n) * np.fft.rfft(law, 2 * n))[:n]
+    return base + creep + crept
+
+
 def textbook(model, v, y, noise, error, horizon, gain=False, drift=False):
     """Return the correction by a Kalman filter with full matrices, sample after sample."""
     gains, times = creep_elements(model)
@@ -209,23 +231,12 @@ def test_cut_off_from_the_sensor_it_goes_on_better_than_what_it_must_beat(seed):
 
 
 def test_it_beats_the_free_run_on_a_stage_that_creeps_as_the_logarithm_of_time():
-    # made by hand: after a step by s the stage goes on by gamma s log10(1 + t / t0)
-    rate, n = SLOW_RATE, 10_000
-    model = creeping()
-    hold = 4000
+    model, n, cut = creeping(), 10_000, 7000
     v = np.concatenate([np.zeros(100), moved(n - 100, frequency=0.5, high=4.0)])
-    t = np.arange(n) / rate
-    base = model.without_dynamics().simulate(v)
-    gamma, t0 = 0.03, 0.05
-    # up to 10 V for four seconds, and down again, before the stream
-    creep = gamma * SPAN * 0.9 * (np.log10(1.0 + (t + hold / rate) / t0) - np.log10(1.0 + t / t0))
-    steps = np.diff(base, prepend=base[0])
-    law = gamma * np.log10(1.0 + np.arange(n) / rate / t0)
-    truth = base + creep + np.fft.irfft(np.fft.rfft(steps, 2 * n) * np.fft.rfft(law, 2 * n))[:n]
+    truth = log_creep(model, v, hold=4.0)
     y = with_noise(truth, 3e-9)
-    cut = 7000
     y[cut:] = np.nan
-    seen = observe(model, Piece(v, y, rate), error=2e-3 * SPAN)
+    seen = observe(model, Piece(v, y, SLOW_RATE), error=2e-3 * SPAN)
     free = model.simulate(v)
     live, late = slice(500, cut), slice(cut, cut + 1000)
     for part, factor in ((live, 3.0), (late, 3.0)):
@@ -424,16 +435,11 @@ def test_a_ramp_of_the_gain_is_followed_within_what_is_claimed():
 
 
 def test_a_stage_whose_law_is_another_is_served_no_worse_with_the_gain_observed():
-    # made by hand: beside H a loop that follows a first-order law of the path, as of Duhem
     rate, step, n = 10_000, 15_000, 50_000
     v = scanned(n, rate)
     model = creeping(float(rate))
     free = model.simulate(v)
-    way = np.diff(model.scaling.u(v), prepend=model.scaling.u(v[0]))
-    z = np.zeros(n)
-    for k in range(1, n):
-        z[k] = z[k - 1] + 8.0 * (way[k] - z[k - 1] * abs(way[k]))
-    truth = np.where(np.arange(n) < step, 1.0, 1.03) * (free + 2e-3 * SPAN * z)
+    truth = np.where(np.arange(n) < step, 1.0, 1.03) * duhem(model, v)
     y = with_noise(truth, 1.5e-9)
     late = slice(step + 2 * rate, None)
     left = {}
