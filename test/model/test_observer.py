@@ -204,6 +204,25 @@ def test_a_sensor_that_is_stuck_moves_the_estimate_no_more():
     assert np.ptp(truth[cut:]) > 0.9 * SPAN * 0.9
 
 
+@pytest.mark.parametrize('claimed', [1e-4, 1e-3, 1e-2])
+def test_a_sensor_that_clips_leaves_it_going_and_less_sure(claimed):
+    model, n = creeping(), 8000
+    v = moved(n)
+    truth = model.simulate(v) + 0.3e-6
+    # the sensor ends at four fifths of the stroke
+    top = truth.min() + 0.8 * np.ptp(truth)
+    y = np.minimum(with_noise(truth, 1.5e-9), top)
+    seen = observe(model, Piece(v, y, SLOW_RATE), error=claimed * SPAN)
+    off = seen.estimate - truth
+    assert rms(off[1000:]) < 0.5 * claimed * SPAN
+    assert rms((y - truth)[1000:]) > 0.08 * SPAN
+    # each time it is less sure at the end than at the begin
+    lost = np.diff(shifted((y == top).astype(float), 100))
+    begins, ends = np.flatnonzero(lost > 0), np.flatnonzero(lost < 0)
+    assert begins.size >= ends.size >= 5
+    assert np.all(seen.std[ends] > seen.std[begins[: ends.size]])
+
+
 def after_earlier_motion(model, v, seed=0, noise=1.5e-9):
     """Return truth and reading along v of a stage that was at the top for two seconds before."""
     before = np.concatenate(
