@@ -234,32 +234,33 @@ def after_earlier_motion(model, v, seed=0, noise=1.5e-9):
 
 @pytest.mark.parametrize('seed', range(3))
 def test_cut_off_from_the_sensor_it_goes_on_better_than_what_it_must_beat(seed):
-    model, n, cut = creeping(), 6000, 3000
+    model, n, cut = creeping(), 15_000, 3000
     v = np.concatenate([np.zeros(500), moved(n - 500, frequency=1.3, high=1.0 + seed)])
     truth, y = after_earlier_motion(model, v, seed)
     reading = y.copy()
     reading[cut:] = np.nan
     seen = observe(model, Piece(v, reading, SLOW_RATE), error=1e-4 * SPAN)
-    late = slice(cut, cut + 1000)
-    free = rms((model.simulate(v) - truth)[late])
-    held = rms((y[cut - 1] - truth)[late])
-    own = rms((seen.estimate - truth)[late])
-    assert own < 0.1 * free and own < 0.1 * held
+    for seconds in (1, 10):
+        late = slice(cut, cut + 1000 * seconds)
+        free = rms((model.simulate(v) - truth)[late])
+        held = rms((y[cut - 1] - truth)[late])
+        own = rms((seen.estimate - truth)[late])
+        assert own < 0.1 * free and own < 0.1 * held
     # the sensor may not be copied: what it reads now is no part of the estimate of now
     assert rms((seen.estimate - y)[1000:cut]) > 1.0e-9
 
 
 def test_it_beats_the_free_run_on_a_stage_that_creeps_as_the_logarithm_of_time():
-    model, n, cut = creeping(), 10_000, 7000
+    model, n, cut = creeping(), 18_000, 7000
     v = np.concatenate([np.zeros(100), moved(n - 100, frequency=0.5, high=4.0)])
     truth = log_creep(model, v, hold=4.0)
     y = with_noise(truth, 3e-9)
     y[cut:] = np.nan
     seen = observe(model, Piece(v, y, SLOW_RATE), error=2e-3 * SPAN)
     free = model.simulate(v)
-    live, late = slice(500, cut), slice(cut, cut + 1000)
-    for part, factor in ((live, 3.0), (late, 3.0)):
-        assert rms((free - truth)[part]) > factor * rms((seen.estimate - truth)[part])
+    # cut off from the sensor it is judged over a second and over ten
+    for part in (slice(500, cut), slice(cut, cut + 1000), slice(cut, cut + 10_000)):
+        assert rms((free - truth)[part]) > 3.0 * rms((seen.estimate - truth)[part])
     # what it claims holds the truth
     inside = np.abs(seen.estimate - truth) < 2.0 * seen.std
     assert np.mean(inside[500:]) > 0.85
