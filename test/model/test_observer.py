@@ -266,6 +266,26 @@ def test_it_beats_the_free_run_on_a_stage_that_creeps_as_the_logarithm_of_time()
     assert np.mean(inside[500:]) > 0.85
 
 
+@pytest.mark.parametrize(
+    ('stage', 'v'),
+    [
+        (lambda m, v: log_creep(m, v, hold=4.0), moved(10_000, frequency=0.5, high=4.0)),
+        (duhem, moved(10_000, frequency=2.0, low=2.0, high=8.0)),
+    ],
+)
+def test_on_stages_of_other_laws_it_errs_no_more_than_it_claims(stage, v):
+    model = creeping()
+    v[:500] *= np.linspace(0.0, 1.0, 500)
+    truth = stage(model, v)
+    seen = observe(model, Piece(v, with_noise(truth, 1.5e-9), SLOW_RATE), error=2e-3 * SPAN)
+    off, std = (seen.estimate - truth)[500:], seen.std[500:]
+    share = np.mean(np.abs(off) < 1.645 * std)
+    # more than 90 % are inside, because these errors have no tails
+    assert share > 0.85
+    assert np.abs(off).max() < 2.0 * rms(off)
+    assert rms(std) < 1.5 * rms(off)
+
+
 @pytest.mark.parametrize('gain', [False, True])
 def test_the_result_depends_neither_on_cuts_nor_on_what_comes_later(gain):
     model, n = creeping(), 4000
