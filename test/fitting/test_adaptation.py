@@ -53,6 +53,13 @@ def scan(seconds, frequency=10.0, swing=6.0, bias=5.0):
     return fade * (bias - 0.5 * swing * np.cos(2 * np.pi * frequency * t))
 
 
+def scan_with_holds(seconds, dwell=0.5):
+    """Return the voltage of moves to random levels, with a hold at each [V]."""
+    levels = np.random.default_rng(0).uniform(1.0, 9.0, round(seconds / dwell))
+    way = np.convolve(np.repeat(levels, round(dwell * RATE)), np.hanning(100))
+    return way[:-99] / np.hanning(100).sum()
+
+
 def learn(adaptation, v, y, block=1000):
     """Return what the model that is learnt says along a motion; of one that begins at rest."""
     t, n = np.arange(v.size) / RATE, adaptation.horizon
@@ -101,6 +108,19 @@ def test_laws_of_every_kind_are_learnt(law):
     adaptation = Adaptation(model, 'hysteresis')
     learn(adaptation, v, changed.simulate(v))
     assert error(adaptation.learnt_model, changed, v) < 1e-4 < error(model, changed, v)
+
+
+@pytest.mark.parametrize('share', [0.3, -0.3])
+def test_other_shares_of_creep_are_learnt(share):
+    gain = (1.0 + share) * np.array(CREEP.parameters['gain'])
+    more = replace(CREEP, parameters={**CREEP.parameters, 'gain': gain.tolist()})
+    changed, v = replace(MODEL, effects=(more,)), scan_with_holds(15.0)
+    adaptation = Adaptation(MODEL, 'hysteresis')
+    learn(adaptation, v, changed.simulate(v))
+    value, std = adaptation.learnt['creep']
+    assert value == pytest.approx(share, abs=0.02) and std < 0.1
+    for w in (v, scan(4.0)):
+        assert error(adaptation.learnt_model, changed, w) < 0.5 * error(MODEL, changed, w)
 
 
 def test_nothing_is_learnt_at_rest_nor_of_what_does_not_move():
