@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 from paper_stage import PAPER
+import piezo_ident as pi
 from piezo_ident.common.files import parse_yaml
 from piezo_ident.fitting.adaptation import Adaptation, LARGEST
 from piezo_ident.model.files import model_from_dict, model_to_yaml
@@ -98,6 +99,34 @@ def test_a_change_is_learnt_within_ten_seconds_of_a_scan(kind, changed):
     assert error(learnt, changed, scan(2.0)) < 1.2 * own < 0.3 * error(MODEL, changed, scan(2.0))
     (entry,) = learnt.identification['adaptation']
     assert entry['adapt'] == kind and entry['seconds'] > 9.0 and 'std' in entry['gain']
+
+
+#: a stage after its change
+CHANGED = replace(stage(TRUE), effects=())
+
+
+@pytest.fixture(scope='module')
+def identified():
+    """Return a model that is identified afresh from a short record of the changed stage."""
+    t = np.arange(2 * RATE) / RATE
+    v = 5.0 - 5.0 * (1.0 - 0.5 * t) * np.cos(2 * np.pi * 3.0 * t)
+    v = np.append(np.zeros(200), v * np.minimum(t / 0.1, 1.0))
+    noise = NOISE * abs(PAPER.scaling.Y) * np.random.default_rng(0).standard_normal(v.size)
+    record = pi.Record.from_arrays(v, CHANGED.simulate(v) + noise, sample_rate=RATE)
+    return pi.identify(record, pi.Settings(max_order=1)).model
+
+
+@pytest.mark.parametrize(('gain', 'width'), [(1.05, 0.0), (1.0, 0.1), (1.05, 0.1)])
+def test_what_is_learnt_errs_as_a_fresh_identification(identified, gain, width):
+    # before the change the stage had a smaller gain and a narrower loop
+    h = wider(identified.hysteresis, 1.0 / (1.0 + width) - 1.0).scaled(1.0 / gain)
+    model, v = replace(identified, hysteresis=h), scan(10.0)
+    adaptation = Adaptation(model, 'hysteresis')
+    learn(adaptation, v, CHANGED.simulate(v))
+    fresh, learnt, old = (
+        error(x, CHANGED, v) for x in (identified, adaptation.learnt_model, model)
+    )
+    assert learnt < 1.2 * fresh < 0.1 * old
 
 
 @pytest.mark.parametrize('law', LAWS)
