@@ -61,16 +61,22 @@ def test_a_reference_that_begins_with_nan_is_joined_at_its_first_number(first):
     assert np.abs(np.diff(v[:4000])).max() < 2e-2
 
 
+@pytest.mark.parametrize('follow', ['off', 'gain'])
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_limits_and_slew_hold_whatever_comes(seed):
+def test_limits_and_slew_hold_whatever_comes(follow, seed):
     rng = np.random.default_rng(seed)
     guard = GuardSettings(1.0, 9.0, 10.0 ** rng.uniform(2.0, 5.0), 20.0, 2.0, FS)
-    tracker, parts, models = Tracker(PAPER, guard), [], [CREEP, PAPER]
+    tracker, parts, models = Tracker(PAPER, guard, follow=follow), [], [CREEP, PAPER]
     for k in range(12):
-        block = 1e-4 * rng.standard_normal(int(rng.integers(1, 300)))
+        block = 1e-4 * rng.standard_normal(int(rng.integers(1, 600)))
         block[rng.random(block.size) < 0.05] = rng.choice([np.nan, np.inf, 1.0])
-        parts.append(tracker.process(block, restarted=bool(rng.random() < 0.2)).v)
+        drive = tracker.process(block, restarted=bool(rng.random() < 0.2))
+        parts.append(drive.v)
+        # a sensor of any size, that loses readings
+        read = 10.0 ** rng.uniform(-7.0, -3.0) * rng.standard_normal(block.size)
+        read[rng.random(block.size) < 0.1] = rng.choice([np.nan, np.inf, 1.0])
+        tracker.measured(Samples(drive.t, read))
         if k % 5 == 4:
             tracker.take_over(tracker.successor(models[k % 2]))
     parts += [tracker.finish().v, tracker.idle(3000)[1]]
