@@ -31,7 +31,8 @@ Y = MODEL.simulate(V) + 0.4e-6 + 2e-9 * np.random.default_rng(1).standard_normal
 class Line:
     """What the node does with the two streams."""
 
-    def __init__(self, model=MODEL, **options):
+    def __init__(self, model=MODEL, v=V, **options):
+        self.v = v
         self.predictor, self.matcher = Predictor(), Matcher()
         self.corrector = Corrector(**options)
         self.predictor.set_model(model)
@@ -47,7 +48,9 @@ class Line:
                 self.displacement(slice(k, k + 100), y)
 
     def voltage(self, cut):
-        samples = Samples(T[cut], V[cut])
+        self.drove(Samples(T[cut], self.v[cut]))
+
+    def drove(self, samples):
         known = self.predictor.memory_known
         prediction = self.predictor.process(samples)
         if prediction is not None:
@@ -55,7 +58,10 @@ class Line:
             self._pairs(self.matcher.predicted(prediction))
 
     def displacement(self, cut, y=Y):
-        self._pairs(self.matcher.measured(Samples(T[cut], y[cut], '', 'displacement')))
+        self.moved(Samples(T[cut], y[cut], '', 'displacement'))
+
+    def moved(self, samples):
+        self._pairs(self.matcher.measured(samples))
 
     def _pairs(self, pairs):
         for pair in pairs:
@@ -206,6 +212,36 @@ def test_a_sensor_at_fault_is_told_within_a_fifth_of_a_second_of_motion(fault, s
     # 0.2 s of a scan of 5 Hz
     assert all(says in said for said in told[at // 100 + 41 :])
     assert bool(line.corrector.doubt) == bool(says)
+
+
+@pytest.mark.parametrize('moves', [True, False])
+@pytest.mark.parametrize(
+    ('fault', 'says'),
+    [
+        (lambda y: y, ''),
+        (lambda y: y + 1e-7, 'stepped'),
+        # about the place of the stage, so that nothing steps
+        (lambda y: 2.0 * y[0] - y, 'against the stage'),
+        (lambda y: np.full(y.size, y[0]), 'stays the same'),
+    ],
+)
+def test_a_sensor_at_fault_is_told_by_a_motion_of_five_percent_of_the_stroke(fault, says, moves):
+    at, first = 2000, 3000
+    v = 5.0 + 0.25 * moves * (1.0 - np.cos(2 * np.pi * 5 * np.maximum(T - T[first], 0.0)))
+    truth, line = MODEL.simulate(v), Line(v=v)
+    far = np.abs(truth - truth[first]) / abs(MODEL.scaling.Y)
+    assert far.max() == pytest.approx(0.053 * moves, abs=2e-3)
+    y = truth + 2e-9 * np.random.default_rng(3).standard_normal(N)
+    y[at:] = fault(y[at:])
+    told = [line.corrector.doubt for _ in line.play(y)]
+    assert not any(told[: at // 100 + 1])
+    # at rest a sound sensor, one of the other sign and one that is stuck read the same
+    if says != 'stepped':
+        assert not any(told[: (first if moves and says else N) // 100])
+    if says and (moves or says == 'stepped'):
+        # a step shows without any motion
+        here = np.argmax(far > 0.05) if moves else at
+        assert any(says in said for said in told[: int(here + 0.2 * FS) // 100])
 
 
 def test_an_error_of_another_kind_is_given_no_name():
