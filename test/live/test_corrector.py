@@ -149,6 +149,37 @@ def test_a_record_with_a_gap_and_left_out_readings_gives_the_same():
     assert run.errors_of_estimate.percent < 0.2 * run.errors.percent
 
 
+CREEP = EffectSetting('creep', {'gain': [0.02, 0.01], 'time_constant': [0.02, 0.5]})
+
+
+@pytest.mark.parametrize(
+    ('model', 'rate'),
+    # a static model holds at any rate
+    [(replace(MODEL, effects=(CREEP,)), FS), (MODEL.without_dynamics(), 7000.0)],
+)
+def test_a_record_of_pieces_far_apart_is_estimated_piece_by_piece(model, rate):
+    line, rng = Line(model), np.random.default_rng(5)
+    pieces = []
+    # the second begins in mid-stream, the third at the top
+    for start, phase in ((0.0, np.pi), (3.0, 1.0), (10.0, 0.0)):
+        t = start + np.arange(2000) / rate
+        v = 5.0 + 4.0 * np.cos(2 * np.pi * 9.0 * (t - start) + phase)
+        y = model.simulate(v) + start * 1e-7 + 2e-9 * rng.standard_normal(t.size)
+        pieces.append(Piece(v, y, rate, start_time=start))
+        for k in range(0, t.size, 100):
+            cut = slice(k, k + 100)
+            line.drove(Samples(t[cut], v[cut]))
+            line.moved(Samples(t[cut], y[cut], '', 'displacement'))
+    run = pi.free_run(model, Record(tuple(pieces), 'apart'))
+    t, y = line.rows
+    assert t.size == 6000
+    assert_allclose(y, np.concatenate(run.estimate), rtol=0, atol=1e-12 * 75e-6)
+    for piece, estimate in zip(pieces, run.estimate, strict=True):
+        # each begins anew, with the free run
+        free = model.stream().process(piece.v, np.arange(piece.n) / rate)
+        assert_allclose(estimate[:100], free[:100], rtol=0, atol=1e-12 * 75e-6)
+
+
 def test_it_follows_the_gain_on_request_and_tells_so_in_order_of_time():
     line = Line(gain=True, rate=100.0)
     list(line.play())

@@ -6,7 +6,7 @@
 from dataclasses import replace
 
 from axes_scanner import AXES
-from live_axes import blocks, coupled, predicted, simulated, tracked
+from live_axes import blocks, coupled, noise, predicted, simulated, tracked
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.live.corrector import Corrector
@@ -135,6 +135,22 @@ def test_the_observer_corrects_the_prediction_of_each_axis():
         assert np.abs(miss[miss.size // 2 :]).max() < 0.1 * abs(by)
 
 
+def test_the_estimate_of_a_record_is_that_of_the_stream():
+    model, v = case(13, creeps=True)
+    y = simulated(model, v) + np.array([[4e-7], [-3e-7]]) + noise(v.shape)
+    live = [
+        x + row for x, row in zip(corrected(model, v, y, correctors_of(model)), y, strict=True)
+    ]
+    channels = {'v_b': v[1], 'y_b': y[1]}
+    record = pi.Record.from_arrays(v[0], y[0], sample_rate=RATE, channels=channels)
+    offline = pi.free_run(model, record)
+    for axis, estimate in zip(AXES, live, strict=True):
+        span = abs(model.axes[axis].scaling.Y)
+        (expected,) = offline[axis].estimate
+        np.testing.assert_allclose(estimate, expected, rtol=0.0, atol=1e-12 * span)
+        assert np.abs(expected - offline[axis].predicted).max() > 1e-7
+
+
 def test_the_feedforward_of_one_axis_refuses_shared_modes():
     model, settings = case(14, 1)[0], GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
     with pytest.raises(
@@ -195,10 +211,11 @@ def corrected(model, v, y, correctors, start=0):
     predictor, got = Predictor(AXES), [[], []]
     predictor.set_model(model)
     for block, moved in zip(blocks(v, RATE, 100, start), blocks(y, RATE, 100, start), strict=True):
+        known = predictor.memory_known
         rows = predictor.process(block).values
         for k, one in enumerate(correctors):
             both = Samples(block.t, rows[k]), Samples(block.t, block.values[k])
-            got[k] += one.predicted(*both, True, predictor.felt[k])
+            got[k] += one.predicted(*both, known, predictor.felt[k])
             got[k] += one.measured(block.t, moved.values[k])
     estimates = [np.concatenate([one.samples.values for one in rows]) for rows in got]
     return [x - row[: x.size] for x, row in zip(estimates, y, strict=True)]
