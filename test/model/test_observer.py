@@ -216,11 +216,13 @@ def test_a_sensor_that_clips_leaves_it_going_and_less_sure(claimed):
     off = seen.estimate - truth
     assert rms(off[1000:]) < 0.5 * claimed * SPAN
     assert rms((y - truth)[1000:]) > 0.08 * SPAN
-    # each time it is less sure at the end than at the begin
+    # each time it is less sure at the end than at the begin, and of the offset than halfway
     lost = np.diff(shifted((y == top).astype(float), 100))
     begins, ends = np.flatnonzero(lost > 0), np.flatnonzero(lost < 0)
     assert begins.size >= ends.size >= 5
-    assert np.all(seen.std[ends] > seen.std[begins[: ends.size]])
+    begins = begins[: ends.size]
+    assert np.all(seen.std[ends] > seen.std[begins])
+    assert np.all(seen.offset_std[ends] > seen.offset_std[(begins + ends) // 2])
 
 
 def after_earlier_motion(model, v, seed=0, noise=1.5e-9):
