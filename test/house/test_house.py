@@ -51,10 +51,17 @@ ROOMS = (
 SIZES = {
     'cli': (2100, 12),
     'common': (1000, 8),
+    'control': (2200, 10),
+    'diagnosis': (6000, 24),
+    'effects': (3100, 23),
     'excitation': (1100, 6),
+    'export': (700, 5),
+    'fitting': (1800, 9),
     'identification': (4400, 18),
+    'identification/solvers': (800, 5),
     'live': (3800, 16),
     'many': (800, 6),
+    'model': (4400, 19),
     'nodes': (4000, 18),
     'nodes/identifier': (1400, 7),
     'operators': (1900, 10),
@@ -65,6 +72,7 @@ SIZES = {
     'report': (2100, 10),
     'report/figures': (1500, 8),
     'residual': (2000, 12),
+    'selection': (300, 4),
     'uncertainty': (900, 12),
 }
 
