@@ -298,6 +298,20 @@ def test_every_page_begins_with_what_it_is_for():
     assert others == []
 
 
+def test_no_test_is_asked_twice():
+    # a test that passes when it is asked again has failed
+    places = ('Makefile', 'setup.cfg', 'setup.py', 'pyproject.toml', '.ci/run', 'colcon.pkg')
+    files = [*(ROOT / place for place in places), *(ROOT / 'test').rglob('conftest.py')]
+    twice = re.compile(r'(?i)rerun|flaky|last-failed|failed-first|--[lf]f\b|retr(y|ies)')
+    found = [
+        f'{file.relative_to(ROOT)}: {line.strip()}'
+        for file in files
+        for line in file.read_text(encoding='utf-8').splitlines()
+        if twice.search(line)
+    ]
+    assert found == []
+
+
 def test_no_file_names_a_package_registry():
     hosts = ['py' + 'pi.org', 'python' + 'hosted']
     found = [
