@@ -78,7 +78,8 @@ def fit_three_steps(
     best, delay_result, missing = fitter.with_useful_dynamics(best, delay_result)
     runs, model = best.runs, best.model
     span = min(e.span[0] for e in best.fit), max(e.span[1] for e in best.fit)
-    warnings = [*warn_of_thresholds(best.held, settings.thresholds), *warn_of_delay(delay_result)]
+    warnings = warn_of_thresholds(best.held, settings.thresholds, best.hysteresis.law)
+    warnings += warn_of_delay(delay_result)
     if outside := warn_of_triangle(*span, scaling):
         warnings += outside
         model = within(model, *span)

@@ -26,6 +26,8 @@ from piezo_ident.record.record import Piece, Record
 HARDLY = 0.1
 #: measured and modelled small-signal gain may differ by this share without a warning
 SLOPE_TOLERANCE = 0.05
+#: smallest error that counts, % of stroke; a record without noise may be fitted exactly
+TINY = 1e-9
 #: zeros of displacement may differ by this share of the stroke without a warning
 ZERO_MOVED = 2e-3
 #: crossings of the range, two for each sweep up and down, that make more than a single sweep
@@ -167,7 +169,7 @@ def warn_of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]
             + ('little of these data' if error > 0.5 * resting else 'little more than the line')
         )
     easy = [row.percent for row in result.errors if row.data == 'held out' and not row.driven]
-    if np.isfinite(chosen) and easy and max(easy) > 2.0 * chosen:
+    if np.isfinite(chosen) and easy and max(easy) > 2.0 * max(chosen, TINY):
         warnings.append(
             f'on rests and ramps the model errs by up to {max(easy):.3g} % of stroke, more than '
             f'the {chosen:.3g} % on the data that chose it. The model lacks an effect of the '
@@ -175,13 +177,12 @@ def warn_of_errors(result: Identification, pieces: Sequence[Piece]) -> list[str]
             'together'
         )
     fitted = result.error('fitted')
-    # a record without noise may be fitted exactly, so a tiny error serves as the smallest
-    if result.dynamics.table is None and held > 3.0 * max(fitted, 1e-9):
+    if result.dynamics.table is None and held > 3.0 * max(fitted, TINY):
         span = max(float(np.ptp(piece.v)) for piece in pieces)
         times = sum(float(np.abs(np.diff(piece.v)).sum()) for piece in pieces) / span
         once = f'the voltage crosses its range {times:.2g} times; drive it more often'
         warnings.append(
-            f'the held-out error is {held / max(fitted, 1e-9):.1f} times the fitted error: this '
+            f'the held-out error is {held / max(fitted, TINY):.1f} times the fitted error: this '
             'record does not determine the model, '
             + (f'as {once}' if times < CROSSINGS else 'or the stage changes in it')
         )
@@ -267,13 +268,13 @@ def _branches(predictions: Sequence[Prediction], signals: Sequence[Array]) -> Ar
     return branches
 
 
-def warn_of_thresholds(held: Sequence[Excerpt], count: int | None) -> list[str]:
-    """Warn if the triangle has no held-out block, which would choose the thresholds."""
-    if count is not None or any(e.use.any() for e in held):
+def warn_of_thresholds(held: Sequence[Excerpt], count: int | None, law: str) -> list[str]:
+    """Warn if the triangle has no held-out block, which would choose the thresholds of plays."""
+    if count is not None or law != 'plays' or any(e.use.any() for e in held):
         return []
     return [
-        'the triangle turns too often to hold a part of it out: the number of thresholds '
-        f'could not be chosen and is {PAPER_COUNT}; use a slower triangle'
+        'the triangle turns too often, or has too few samples, to hold a part of it out: the '
+        f'number of thresholds could not be chosen and is {PAPER_COUNT}; use a slower triangle'
     ]
 
 
@@ -288,11 +289,11 @@ def warn_of_triangle(lowest: float, highest: float, scaling: Scaling) -> list[st
 
 
 def warn_of_range(runs: Sequence[Run], fitted: Sequence[Mask], scaling: Scaling) -> list[str]:
-    """Warn if the held-out parts leave the voltage range of the fitted parts."""
+    """Warn if samples that are held out leave the voltage range of the samples that are fitted."""
     pairs = list(zip(runs, fitted, strict=True))
-    parts = [run.u[mask] for run, mask in pairs], [run.u[~mask] for run, mask in pairs]
-    spans = [(min(map(np.min, part)), max(map(np.max, part))) for part in parts]
-    if spans[1][0] > spans[0][0] - 0.01 and spans[1][1] < spans[0][1] + 0.01:
+    sides = ([run.u[run.use & (mask == side)] for run, mask in pairs] for side in (True, False))
+    spans = [(part.min(), part.max()) for part in map(np.concatenate, sides) if part.size]
+    if len(spans) < 2 or (spans[1][0] > spans[0][0] - 0.01 and spans[1][1] < spans[0][1] + 0.01):
         return []
     one, other = (f'{scaling.v(low):.3g} .. {scaling.v(high):.3g} V' for low, high in spans)
     return [
