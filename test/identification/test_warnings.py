@@ -9,22 +9,31 @@ import numpy as np
 from paper_stage import PAPER
 import piezo_ident as pi
 from piezo_ident.identification.errors import predictions_of
-from piezo_ident.identification.prepare import Excerpt, runs_of, scaling_of
+from piezo_ident.identification.prepare import Excerpt, excerpts_of, runs_of, scaling_of
+from piezo_ident.identification.results import ErrorRow
 from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import DelayResult, StepDelay
 from piezo_ident.identification.warnings import (
     only_jumps,
     warn_of_delay,
+    warn_of_range,
     warn_of_shape,
+    warn_of_thresholds,
+    warn_of_triangle,
+    warn_of_zeros,
     warnings_of,
 )
+from piezo_ident.model.scaling import Scaling
 from piezo_ident.operators.play import play_columns
-from piezo_ident.record.record import Piece, Record
+from piezo_ident.record.record import Piece, Record, Segment
 import pytest
+from scipy.optimize import OptimizeResult
 
 FS = 1000.0
 T = np.arange(2000) / FS
 SINE = 0.5 - 0.5 * np.cos(2.0 * np.pi * T)
+#: 10 V and 10 um
+SCALING = Scaling(0.0, 10.0, 0.0, 1e-5, (0.0, 10.0))
 
 
 def excerpt(u):
@@ -148,3 +157,139 @@ def test_two_delays_that_were_not_taken_are_not_said_to_be_followed(linear):
         delay = DelayResult(3, 0.5, source, step, None, 7)
         said = warnings_of(replace(result, delay=delay), [record], list(record))
         assert any('3 samples, the ARX fit says 7' in x and followed in x for x in said)
+
+
+def slopes(result, measured):
+    dynamics = replace(result.dynamics, slope_measured=measured, slope_model=0.8)
+    return replace(result, dynamics=dynamics)
+
+
+def flown(result, loss, optimum=2.0, **more):
+    """Return a result of which the swarm left a sum of squares."""
+    losses = {'swarm_loss': loss, 'optimum_loss': optimum, **more}
+    return replace(result, hysteresis=replace(result.hysteresis, swarm=OptimizeResult(), **losses))
+
+
+def erring(result, chosen, **held):
+    """Return a result with an error on the data that chose it, and on segments held out."""
+    rows = [ErrorRow('r', 'triangle', chosen, chosen, 99.0, 100, 'selection')]
+    rows += [ErrorRow('r', label, x, x, 99.0, 100, 'held out') for label, x in held.items()]
+    return replace(result, errors=tuple(rows))
+
+
+#: what is changed of a result, words of the reason, and what is said, nothing where it is not so
+OF_FIT = {
+    'gain above': (
+        *(lambda r: slopes(r, 0.85), 'small-signal gain'),
+        'of the noise, 0.85, is not the slope of H at its bias, 0.8 (',
+    ),
+    'gain below': (lambda r: slopes(r, 0.75), 'small-signal gain', 'noise, 0.75, is not'),
+    'gain near': (lambda r: slopes(r, 0.83), 'small-signal gain', ''),
+    'no gain': (lambda r: slopes(r, np.nan), 'small-signal gain', ''),
+    'swarm': (lambda r: flown(r, 2.5), 'the swarm ended', 'ended 25 % of the loss above'),
+    'swarm, polished': (
+        *(lambda r: flown(r, 2.5, polished=True), 'the swarm ended'),
+        'above the least-squares optimum, before polishing',
+    ),
+    'swarm, near': (lambda r: flown(r, 2.01), 'the swarm ended', ''),
+    'swarm, no loss': (lambda r: flown(r, 0.0, optimum=0.0), 'the swarm ended', ''),
+    'no swarm': (lambda r: flown(r, 2.5, swarm_loss=None), 'the swarm ended', ''),
+    'rest': (
+        *(lambda r: erring(r, 0.2, idle=0.5, ramp=0.3), 'lacks an effect'),
+        'by up to 0.5 % of stroke, more than the 0.2 % on the data that chose it',
+    ),
+    'ramp': (lambda r: erring(r, 0.2, ramp=0.41), 'lacks an effect', 'up to 0.41 % of stroke'),
+    'rest, near': (lambda r: erring(r, 0.2, idle=0.39), 'lacks an effect', ''),
+    'driven': (lambda r: erring(r, 0.2, noise=0.5, idle=0.1), 'lacks an effect', ''),
+    'no selection': (lambda r: erring(r, np.nan, idle=0.5), 'lacks an effect', ''),
+    'rounding': (lambda r: erring(r, 1e-13, idle=1e-11), 'lacks an effect', ''),
+}
+
+
+def told(texts, words, said):
+    """Return whether a reason is given once, with what is said; not at all where that is empty."""
+    found = [text for text in texts if words in text]
+    return len(found) == bool(said) and all(said in text for text in found)
+
+
+@pytest.mark.parametrize('name', OF_FIT)
+def test_a_reason_of_the_fit_is_told_where_it_is_so(linear, name):
+    record, result = linear
+    change, words, said = OF_FIT[name]
+    assert told(warnings_of(change(result), [record], list(record)), words, said)
+
+
+def test_labels_that_mean_nothing_are_named_and_others_are_let_be(linear):
+    record, result = linear
+    [piece] = record
+    near = 'nothing here: triangl (did you mean triangle?)'
+    for label, said in (('triangl', near), ('triangle', ''), ('my part', '')):
+        labelled = Record((replace(piece, segments=(Segment(label, 0, 100),)),))
+        assert told(warnings_of(result, [labelled], [piece]), 'labels that mean nothing', said)
+
+
+def run_of(v, label=None):
+    """Return the run of a voltage whose displacement it is."""
+    segments = () if label is None else (Segment(label, 0, v.size),)
+    [run] = runs_of([Record((Piece(v, 1e-6 * v, FS, segments=segments),))], FS, SCALING)
+    return run
+
+
+V, EARLY, ALWAYS = 10.0 * SINE, T < 1.0, T >= 0.0
+
+
+@pytest.mark.parametrize(
+    ('fitted', 'use', 'said'),
+    [
+        (V < 8.0, ALWAYS, 'covers 0 .. 7.99 V, the held-out part 8.01 .. 10 V: '),
+        (V > 3.0, ALWAYS, 'covers 3.01 .. 10 V, the held-out part 0 .. 2.99 V: '),
+        (V < 9.95, ALWAYS, ''),
+        (V > 0.05, ALWAYS, ''),
+        (EARLY, ALWAYS, ''),
+        # readings that were lost tell nothing, and are not judged
+        (EARLY, ~EARLY | (V < 8.0), 'covers 0 .. 7.99 V, the held-out part 0 .. 10 V: '),
+        (V < 8.0, V < 8.05, ''),
+        (EARLY, EARLY, ''),
+    ],
+)
+def test_extrapolation_is_told_of_what_is_held_out_beyond_the_fitted_part(fitted, use, said):
+    texts = warn_of_range([replace(run_of(V), use=use)], [fitted], SCALING)
+    assert told(texts, 'extrapolation', said)
+
+
+@pytest.mark.parametrize(
+    ('sweeps', 'size', 'count', 'law', 'said'),
+    [
+        # 60 blocks of which one in five is held out
+        (2, 2000, None, 'plays', ''),
+        (2, 2000, 7, 'plays', ''),
+        (130, 2000, None, 'plays', 'the number of thresholds could not be chosen and is 10'),
+        (130, 2000, 7, 'plays', ''),
+        # other parts chose the law, and it has thresholds of its own
+        (130, 2000, None, 'preisach', ''),
+        # a block of one sample shows no turn
+        (2, 60, None, 'plays', 'or has too few samples'),
+    ],
+)
+def test_thresholds_that_no_triangle_could_choose(sweeps, size, count, law, said):
+    v = 10.0 * np.abs((np.arange(size) * sweeps / size + 1.0) % 2.0 - 1.0)
+    held = excerpts_of([run_of(v, 'triangle')], 'triangle', held=True)
+    assert told(warn_of_thresholds(held, count, law), 'turns too often', said)
+
+
+@pytest.mark.parametrize(
+    ('lowest', 'highest', 'said'),
+    [(0.0, 0.8, 'reaches 0 .. 8 V'), (0.03, 1.0, 'reaches 0.3 .. 10 V'), (0.008, 0.992, '')],
+)
+def test_a_triangle_that_does_not_cover_the_record_is_told(lowest, highest, said):
+    assert told(warn_of_triangle(lowest, highest, SCALING), 'does not cover', said)
+
+
+@pytest.mark.parametrize(
+    ('offset', 'said'), [(3e-8, 'lies 0.03 um from'), (-3e-8, 'lies -0.03 um from'), (1.9e-8, '')]
+)
+def test_a_zero_that_moved_is_told_by_its_size(offset, said):
+    for Y in (SCALING.Y, -SCALING.Y):
+        texts = warn_of_zeros({('one', 0.0): offset, ('two', 0.0): 0.0}, replace(SCALING, Y=Y))
+        assert told(texts, 'one: its zero of displacement', said)
+        assert len(texts) == bool(said)
