@@ -4,6 +4,7 @@
 """What is no answer to a voltage is refused, and nothing else."""
 
 import numpy as np
+import piezo_ident as pi
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import held_out_errors, refuse_delay, refuse_undriven
 from piezo_ident.operators.play import play_columns
@@ -31,6 +32,16 @@ def test_a_loop_of_little_coherence_is_an_answer():
     driven, resting = held_out_errors(Piece(TRIANGLE, y, FS))
     assert driven < 0.9 * resting
     refuse_undriven([record(TRIANGLE, y)])
+
+
+def test_a_butterfly_is_identified_and_what_h_misses_is_told():
+    y = butterfly(TRIANGLE)
+    result = pi.identify(record(TRIANGLE, y), pi.Settings(thresholds=10, max_order=2))
+    assert np.isfinite(result.model.simulate(TRIANGLE)).all()
+    # a result of which the half that H can hold is explained at most
+    assert result.headline.percent > 5.0
+    (even,) = (said for said in result.warnings if 'even in the voltage about 0 V' in said)
+    assert int(even.partition('%')[0]) > 80
 
 
 @pytest.mark.parametrize(
