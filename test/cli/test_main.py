@@ -306,7 +306,14 @@ def test_identify_without_model_writes_nothing(capsys, tmp_path, made, monkeypat
     monkeypatch.chdir(tmp_path)
     text = succeed(capsys, 'identify', made / 'record.npz', *FAST)
     assert '--model' in text
+    assert '2 ± ' in text and '(given)' not in text
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_delay_that_is_typed_is_used_and_said_to_be_given(capsys, made):
+    # not what the record tells
+    text = succeed(capsys, 'identify', made / 'record.npz', *FAST, '--delay', 3)
+    assert '3 samples (given)' in text
 
 
 def test_identify_writes_model_and_report_and_json(capsys, tmp_path, made):
