@@ -16,6 +16,7 @@ from piezo_ident.excitation.program import parse_program
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.metrics import expected_error, worst_error
 from piezo_ident.model.stage_model import EffectSetting
+from piezo_ident.operators.play import play_columns
 from programs import identification_program
 import pytest
 
@@ -80,6 +81,25 @@ def test_an_identified_model_brings_the_stage_where_it_is_told(name, request):
     assert error < (3.0 if name == 'refined' else 10.0) * drive.expected
     if name == 'refined':
         assert drive.expected < 0.5 * request.getfixturevalue('labelled').inverse(wanted).expected
+    header = pi.export_c(model)
+    assert 'stage_feedforward_step' in header and 'stage_step' in header
+
+
+def test_an_identified_model_with_a_wide_law_is_inverted_and_exported():
+    rate = 400.0
+    t = np.arange(1200) / rate
+    v = 5.0 - 5.0 * np.cos(2.0 * np.pi * t) * (1.0 - 0.3 * np.floor(t))
+    y = v + 0.06 * v**2 + play_columns(v, np.array([2.0, 5.0]), np.zeros(2)).sum(axis=0)
+    y = 1e-6 * (y + 5e-3 * np.random.default_rng(0).standard_normal(v.size))
+    record = pi.Record.from_arrays(v, y, sample_rate=rate)
+    result = pi.identify(record, Settings(thresholds=6, max_order=2))
+    assert result.hysteresis.law != 'plays'
+    wanted = 1e-6 * (8.0 - 4.0 * np.cos(2.0 * np.pi * np.arange(800) / 400.0))
+    drive = pi.invert(result.model, wanted)
+    assert drive.error < 0.1
+    reached = result.model.simulate(drive.v)[drive.lead :]
+    assert 100.0 * np.sqrt(np.mean((reached - wanted) ** 2)) / np.ptp(wanted) < 0.1
+    assert 'stage_feedforward_step' in pi.export_c(result.model)
 
 
 def test_a_model_holds_its_error_on_the_motion_that_it_knows_least(labelled, refined):
