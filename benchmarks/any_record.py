@@ -23,7 +23,7 @@ import bouc_wen
 import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
-from piezo_ident.common.errors import ModelError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from scipy.optimize import least_squares, nnls
 from scipy.signal import butter, chirp, lfilter, sosfiltfilt
@@ -283,7 +283,7 @@ def drive_fault(model: pi.StageModel, rng: np.random.Generator) -> str:
         drive = pi.invert(model, wanted).v
         still = replace(model, dynamics=Dynamics.unit(), delay=Delay(0), effects=())
         static = pi.invert(still, wanted).v
-    except ModelError as error:
+    except (DataError, ModelError) as error:
         return f'refuses: {error}'
     if np.ptp(drive) > 1.2 * np.ptp(static):
         return f'drive {np.ptp(drive) / np.ptp(static):.2f} times as wide'

@@ -3,12 +3,15 @@
 
 """A quick part of the study of any record: short records, the best peer, and the inverse."""
 
+from dataclasses import replace
 import warnings
 
 import any_record as study
 import bouc_wen
 import numpy as np
+from paper_stage import with_mode
 from piezo_ident.identification.results import Settings
+from piezo_ident.operators.dynamics import Dynamics
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
@@ -49,6 +52,19 @@ def quick():
 def test_H_rises_and_the_inverse_asks_for_no_jump(identified, quick, seed):
     for case, model in identified + quick:
         assert study.drive_fault(model, np.random.default_rng(seed)) == '', case.kind
+
+
+def test_a_bad_model_is_a_fault():
+    rng, sound = np.random.default_rng(0), with_mode(300.0)
+    h = sound.hysteresis
+    falls = replace(h, p2=h.p2 - h.lowest_slope() - 1e-3)
+    assert study.drive_fault(sound, rng) == ''
+    assert study.drive_fault(replace(sound, hysteresis=falls), rng) == 'H falls'
+    # lags at 100 and at 30 Hz, which a motion of up to 200 Hz has the drive make up for
+    for pole, words in ((0.97, 'drive 1'), (0.99, 'refuses: ')):
+        lag = Dynamics([-pole], [1.0 - pole])
+        fault = study.drive_fault(replace(sound, dynamics=lag), np.random.default_rng(0))
+        assert fault.startswith(words), fault
 
 
 def test_a_slow_motion_holds_nothing_fast_with_its_ends():
