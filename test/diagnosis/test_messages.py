@@ -13,6 +13,7 @@ from measured_data import measured_record
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import diagnose_command
+from piezo_ident.control.hysteresis_inverse import rising
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load
 from piezo_ident.model.stage_model import EffectSetting
@@ -123,6 +124,7 @@ def test_all_that_a_diagnosis_says_agrees(diagnosed, name):
     result, data, page, refined = diagnosed(given, record, only)
     assert data['verdict'] == verdict, data['sentence']
     assert bool(data['model_changes']) == is_changed, data['sentence']
+    assert refined.hysteresis.lowest_slope() > 0.0
     agree(result, data, page, refined, record)
 
 
@@ -170,6 +172,8 @@ def agree(result, data, page, refined, record):
         assert verdict != 'refitted' and 'falls' not in sentence
         assert data['hysteresis']['law'] == '' and 'model stays as given' in text
         assert not effects
+    # a model that cannot be inverted is no better one; H may fall within narrow plays alone
+    assert rising(refined.hysteresis).lowest_slope() > 0.0
     # every number of the sentence is one of the result
     share = 100.0 * (1.0 - data['unexplained']['share_of_explainable'])
     gain = data['gain'] or {'value': 1.0, 'share': 0.0}

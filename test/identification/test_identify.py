@@ -321,6 +321,7 @@ def test_measured_one_hertz_record():
     modes = result.model.dynamics.modes(result.model.sample_rate)
     assert held.n == 7500
     assert held.percent <= 0.17
+    assert result.model.hysteresis.lowest_slope() > 0.0
     readme = (Path(__file__).parents[2] / 'README.md').read_text(encoding='utf-8')
     said = re.search(r'measured 1 Hz record.* errs by ([\d.]+) %', readme)
     assert float(said[1]) == round(held.percent, 2)
@@ -357,6 +358,7 @@ def test_measured_open_loop_is_identified_with_a_warning():
     result = identify(measured_record('afm_open_loop.csv'), Settings(thresholds=10))
     assert result.warnings
     assert result.model.dynamics.is_stable
+    assert result.model.hysteresis.lowest_slope() > 0.0
     assert result.error('fitted') < 2.0
 
 
@@ -500,6 +502,8 @@ def test_awkward_records_give_a_result_or_a_reason(case):
         assert '\n' not in str(error)
         return
     assert result.model.dynamics.is_stable
+    # at the stops of a sensor H may fall, and `invert` then refuses it
+    assert result.model.hysteresis.lowest_slope() > 0.0 or case == 'saturated at both ends'
     # a result is told of, and is no nonsense: it can be written, and does not explode
     model_from_dict(model_to_dict(result.model))
     low, high = result.model.scaling.range
