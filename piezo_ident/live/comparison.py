@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 import numpy as np
@@ -186,13 +186,17 @@ class AxisComparison:
             return '', f'corrected: {self.corrector.corrected}'
         return '', ''
 
-    @property
-    def problems(self) -> list[str]:
-        """List the faults of readings and voltage in the last second."""
+    def problems(self, publishers: Collection[str]) -> list[str]:
+        """
+        List the faults of readings and voltage in the last second.
+
+        `publishers` are the names of the nodes that publish the displacement.
+        """
         faults = [self.left_out]
         if self.again:
             about = 'samples of displacement came again or out of turn: do two nodes publish it?'
-            faults.append(f'{self.again} {about}')
+            names = f' {" and ".join(sorted(publishers))} do' if len(publishers) > 1 else ''
+            faults.append(f'{self.again} {about}{names}')
         span = 0.0 if self.model is None else float(np.ptp(self.model.scaling.range))
         if self.room is not None and self.room < -1e-3 * span:
             faults.append(f'the voltage leaves the identified range by {-self.room:.3g} V')

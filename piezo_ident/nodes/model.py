@@ -36,7 +36,7 @@ from piezo_ident.model.multi_axis import alone, models_of, shares_modes, with_ow
 from piezo_ident.nodes.lab_node import LabNode, OK, WARN
 from piezo_ident.nodes.model_loader import Model, ModelLoader, no_file
 from piezo_ident.nodes.parameter_node import home_problem
-from piezo_ident.nodes.wire import from_message, PREVIEW, STREAM, to_message
+from piezo_ident.nodes.wire import from_message, PREVIEW, publishers, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -338,7 +338,8 @@ class ModelNode(LabNode):
             verdict, correction = one.verdict(self.values['warn_ratio'])
             mismatch = p.problem if is_silent else problems[tail]
             corrected[tail] = '' if mismatch else correction
-            problems[tail] = '; '.join(filter(None, [mismatch or verdict, *one.problems]))
+            faults = one.problems(publishers(self, f'displacement{tail}').values())
+            problems[tail] = '; '.join(filter(None, [mismatch or verdict, *faults]))
         lost = 'the memory is unknown until the voltage has been at its lowest'
         message = '; '.join(filter(None, [self._joined(problems), lost * self._is_lost]))
         told = '; '.join(filter(None, [message or 'predicting', self._joined(corrected)]))

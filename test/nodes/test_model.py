@@ -443,14 +443,26 @@ def judged(g, several, y):
 
 def test_two_stages_at_once_are_said(fast):
     reset(fast)
-    several = blocks(4000)
-    for block in several:
-        fast.publish('voltage', block)
-        for level in (0.0, 1e-6):
-            y = np.full(block.t.size, level)
-            fast.publish('displacement', Samples(block.t, y, block.segment, 'displacement'))
-    said = 'samples of displacement came again or out of turn: do two nodes publish it?'
-    fast.wait(lambda: any(said in d['message'] for d in fast.diagnoses('model')), said)
+    # as where a launch file is started twice; in silence a stage at 0 V is at rest
+    stages = fast.start_all(('stage', {'seed': 1}), ('stage', {'seed': 2}))
+    told = {node: len(fast.diagnoses(node)) for node in ('model', 'stage')}
+    ticks = iter(range(0, 10**9, 100))
+
+    def said(node, text):
+        return any(text in d['message'] for d in fast.diagnoses(node)[told[node] :])
+
+    def more():
+        (b,) = blocks(100, next(ticks))
+        fast.publish('voltage', replace(b, values=np.zeros(100)))
+
+    again = 'samples of displacement came again or out of turn: do two nodes publish it?'
+    for node, text in (
+        ('model', again),
+        ('model', '/stage and /stage do'),
+        ('stage', 'another node is called /stage too'),
+    ):
+        fast.wait(lambda n=node, x=text: said(n, x), f'{node} to say {text!r}', meanwhile=more)
+    assert [stage.stop() for stage in stages] == [0, 0]
 
 
 def test_an_error_of_the_past_is_not_shown_when_nothing_can_be_judged(fast):
