@@ -411,6 +411,28 @@ def test_a_step_of_the_sensor_is_accepted_at_once(fast):
     assert np.abs(estimate[-1].values - y[-100:]).max() < 2e-8
 
 
+@pytest.mark.parametrize(
+    ('fault', 'says'),
+    [
+        (lambda y: 60e-6 - y, 'it moves against the stage'),
+        (lambda y: np.full(y.size, y[0]), 'it stays the same while the stage should move'),
+    ],
+    ids=['other sign', 'stuck'],
+)
+def test_a_sensor_of_the_other_sign_and_one_that_is_stuck_are_told(fast, fault, says):
+    reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}}))
+    y = model_of(paper()).stream().process(sine(12_000)[1], np.arange(12_000) / FS)
+    y[6000:] = fault(y[6000:])
+    since, said = len(fast.statuses('model')), f'reading or zero of the displacement: {says}'
+    paired(fast, blocks(12_000), y)
+    fast.wait(
+        lambda: any(
+            said in s['text'] and s['level'] == '1' for s in fast.statuses('model')[since:]
+        ),
+        said,
+    )
+
+
 def test_the_estimate_goes_on_behind_a_gap_and_a_restart(fast):
     reset(fast, paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}}))
     # a zero that moved is in each estimate
