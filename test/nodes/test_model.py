@@ -9,9 +9,11 @@ import time
 from course import column, FS, model_of, paper
 from graph import Graph
 import numpy as np
+from piezo_ident.model.estimate import observe
 from piezo_ident.model.files import load, model_to_yaml
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.blocks import Samples
+from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import BandStream, KEY, PredictionBand
 import pytest
 from rclpy.qos import QoSProfile
@@ -431,6 +433,34 @@ def test_a_sensor_of_the_other_sign_and_one_that_is_stuck_are_told(fast, fault, 
         ),
         said,
     )
+
+
+def test_displacement_is_as_old_as_the_horizon_where_it_is_used(fast):
+    assert fast.set('model', 'horizon', 250) == (True, '')
+    text = paper(identification={'errors': {'unit': '% of stroke', 'held_out': 0.01}})
+    reset(fast, text)
+    v = sine(8000)[1]
+    y = model_of(text).stream().process(v, np.arange(8000) / FS) + 3e-7
+    several = [replace(b, segment='horizon') for b in blocks(8000)]
+    estimate, prediction = fast.collect('estimate'), fast.collect('prediction')
+
+    def came(topic):
+        return [b for b in topic if b.segment == 'horizon']
+
+    paired(fast, several[:40], y[:4000])
+    send(fast, several[40:])
+    fast.wait(lambda: len(came(prediction)) == 80, 'the predictions')
+    # two blocks and a half after the last displacement
+    fast.wait(lambda: len(came(estimate)) >= 42, 'the estimates')
+    assert len(came(estimate)) == 42
+    for b, part in zip(several[40:], np.split(y[4000:], 40), strict=True):
+        fast.publish('displacement', Samples(b.t, part, b.segment, 'displacement'))
+    fast.wait(lambda: len(came(estimate)) == 80, 'all estimates')
+    seen = observe(model_of(text), Piece(v, y, FS), horizon=250)
+    np.testing.assert_allclose(
+        column(came(estimate))[1], seen.estimate, rtol=0, atol=1e-12 * 75e-6
+    )
+    assert fast.set('model', 'horizon', 100) == (True, '')
 
 
 def test_the_estimate_goes_on_behind_a_gap_and_a_restart(fast):
