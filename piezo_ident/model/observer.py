@@ -35,7 +35,8 @@ take all creep for a shift.
 
 The unknown output of a play lies between bounds, which the voltage draws together; see
 `MemoryBounds`.  The contribution of these plays is part of the offset, which may change by as much
-as their band shrinks.
+as their band shrinks, once G has passed the change on.  At the start G still moves by what came
+before, so the offset stays open until G has settled.
 
 Kalman filter: R. E. Kalman, "A new approach to linear filtering and prediction problems", J. Basic
 Engineering 82(1), 1960, doi:10.1115/1.3662552.  Weights of hypotheses: D. T. Magill, "Optimal
@@ -55,7 +56,8 @@ from piezo_ident.model.initial_memory import creep_elements
 from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.metrics import expected_error
 from piezo_ident.model.stage_model import StageModel
-from piezo_ident.operators.chain import Block
+from piezo_ident.operators.chain import Block, Chain
+from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
 
 #: age of the displacement that corrects an estimate [samples]: a block
 HORIZON = 100
@@ -190,6 +192,8 @@ class Observer:
         low, high = model.scaling.u(model.scaling.range).tolist()
         self._low, self._width = low, high - low
         self._input = model.input_chain()
+        operators = DynamicsOperator(model.dynamics), DelayOperator(model.total_delay)
+        self._output = Chain(operators)
         self._bounds = MemoryBounds(model.hysteresis, low, (low, high))
         self._is_known, self._started, self._is_lost = known, False, False
 
@@ -241,6 +245,7 @@ class Observer:
         self._state = kernel.State(x, P, weight, self._row.copy(), group, np.zeros(c), now)
         kernel.tell(law, self._state)
         self._input.reset(u0, u0)
+        self._output.reset(u0, 0.0)
         if self._is_known or u0 - self._low < REST * self._width:
             self._bounds.came_down(u0)
         else:
@@ -325,14 +330,17 @@ class Observer:
         if self._is_lost:
             self._bounds.forget(float(u[0]))
             self._is_lost = False
-        band = g * self._bounds.follow(u)
+        band = self._bounds.follow(u)
+        # G passes the band on from zero at the start, as if that were the motion from before
+        reached = np.abs(self._output.process(Block(t=time, v=u, x=band)).x)
+        band *= g
         path = np.abs(np.diff(u, prepend=self._last)) / self._width
         self._last = float(u[-1])
-        new = np.stack([scaling.x(free), path, band])
+        new = np.stack([scaling.x(free), path, reached])
         if self._past is None:
             # no displacement before the start
             self._past = np.full((3, self.horizon), np.nan)
-            self._state.now[kernel.BAND] = band[0]
+            self._state.now[kernel.BAND] = reached[0]
         whole = np.concatenate([self._past, new], axis=1)
         before, self._past = whole[:, : u.size].copy(), whole[:, u.size :]
         out = np.empty((10, u.size))

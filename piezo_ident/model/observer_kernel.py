@@ -331,6 +331,7 @@ def _follow_drift(law: Law, s: State) -> None:
 @ordered_kernel
 def _end_group(law: Law, s: State) -> None:
     now = s.now
+    own = now[MOVED] - now[SPREAD]
     _let_time_pass(law, s)
     mean, free, count = _typical(s.group, np.sqrt(law.numbers[NOISE]))
     if count > 0:
@@ -341,6 +342,9 @@ def _end_group(law: Law, s: State) -> None:
     if enough and _is_believed(law, s, mean, count):
         _measure(law, s, mean, count)
         now[MOVED] = now[SPREAD] = 0.0
+        # the mean of a group may lie anywhere in the change of the offset within the group
+        for b in range(s.weight.size):
+            s.P[b, 0, 0] += own * own / 3.0
     tell(law, s)
     if _has_gain(law, s) and law.numbers[DRIFT_VAR] == 0.0:
         _follow_drift(law, s)

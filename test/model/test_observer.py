@@ -394,6 +394,20 @@ def test_in_midstream_it_soon_errs_no_more_than_with_its_memory_known(stage, cla
     assert rms((seen.estimate - y)[after]) < 1.5 * rms((known.estimate - y)[after])
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_what_unknown_plays_do_comes_through_the_dynamics(seed):
+    # at the start G still answers noise from before; where noise goes on, plays move at once
+    model = replace(PAPER, identification={'errors': {'held_out': 0.002}})
+    noise = 5.0 + np.random.default_rng(seed).uniform(-0.4, 0.4, 8000)
+    before = np.concatenate([np.linspace(0.0, 5.5, 2000), [5.0], noise[:2000]])
+    v = np.concatenate([np.full(2000, before[-1]), noise[2000:]])
+    truth = model.simulate(np.concatenate([before, v]))[before.size :]
+    seen = observe(model, Piece(v, with_noise(truth, 1.5e-9, seed), FS))
+    assert rms((model.stream().process(v, np.arange(v.size) / FS) - truth)[2300:]) > 1e-3 * SPAN
+    for begin, end in ((300, 2000), (2300, 8000)):
+        assert rms((seen.estimate - truth)[begin:end]) < 1e-4 * SPAN
+
+
 def test_it_takes_at_most_two_microseconds_a_sample():
     h = Hysteresis(np.linspace(0.01, 0.99, 40), np.full(40, 0.01), 0.0, 0.6)
     model, n = creeping(FS, 0.005, np.geomspace(0.01, 1000, 10), h), 200_000
