@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
+from layouts import messages_of
 import piezo_ident as pi
 from piezo_ident.model.estimate import observe
 from processes import take_domain
@@ -92,6 +93,9 @@ def test_the_bag_is_the_wire_and_the_free_run_is_the_same_live_replayed_and_offl
     assert np.nanmax(np.abs(recording.motion.estimate - offline)) <= 1e-12 * recorded.stroke
     assert recorded.verdict in lab.progress.lines[-1]
     assert 'of stroke' in recorded.verdict
+    # by default the recorder keeps what the model says
+    kept = {topic for topic, _ in messages_of(recorded.bag)}
+    assert {'/prediction', '/residual', '/estimate', '/corrections'} <= kept
     # what was asked can be asked again
     assert 'ros2 service call /recorder/start std_srvs/srv/Trigger' in recorded.commands
 
