@@ -8,6 +8,8 @@ Programs that do nothing else take most of the machine, and one node gets no tim
 stopped until more was sent than half a second holds.
 """
 
+import json
+import re
 import signal
 
 from course import column, FS, voltage_of
@@ -24,6 +26,7 @@ limits: [0, 10]
 segments:
   - {signal: idle, duration: 0.1}
   - {signal: sine, bias: 5, amplitude: 5, frequency: 1, periods: 2}
+  - {signal: step, bias: 5, size: 1, hold: 0.03, count: 8}
   - {signal: idle, duration: 0.1}
 """
 TOPICS = ('voltage', 'displacement', 'applied_voltage')
@@ -92,3 +95,14 @@ def test_a_voltage_that_does_not_come_is_told(lab):
     told = 'samples of applied_voltage are a ramp to rest in silence'
     lab.wait(lambda: told in lab.status('identifier')['text'], told)
     assert lab.status('identifier')['level'] == '1'
+    # of the report, the shortest work is enough
+    count, reports = (
+        re.search(rf'(\d+) {told}', lab.status('identifier')['text'])[1],
+        lab.texts('report'),
+    )
+    end = lab.finish('identifier/identify_delay')
+    assert (end['state'], end['level']) == ('done', '1'), end
+    lab.wait(lambda: reports, 'the report')
+    faults = {fault['name']: fault for fault in json.loads(reports[-1])['data_faults']}
+    assert faults['ramp:silence']['count'] == int(count)
+    assert 'the driver ramped to rest' in faults['ramp:silence']['action']
