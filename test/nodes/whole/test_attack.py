@@ -4,12 +4,13 @@
 """The graph under attack: nodes stay up, say what they refuse, and the voltage is safe."""
 
 from pathlib import Path
+import re
 
 from attack import contradiction, odd_messages, start
 from course import FS, level, paper
 from graph import Graph
 import numpy as np
-from piezo_ident.nodes.wire import SERVICE
+from piezo_ident.nodes.wire import SERVICE, to_message
 from piezo_ident.record.blocks import Samples, time_problem
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -22,6 +23,9 @@ pytestmark = pytest.mark.loads
 @pytest.fixture(scope='module')
 def attack():
     with Graph() as g:
+        # on the topic, the model node would hear it, too
+        model = g.folder / 'model.yaml'
+        model.write_text(paper())
         yield start(
             g,
             {
@@ -31,12 +35,43 @@ def attack():
                 'model': {},
                 'recorder': {'output': str(g.folder / 'bag')},
                 'player': {},
+                'feedforward': {'model': str(model), 'silence': 600.0},
             },
         )
 
 
+def refused_messages(topic='voltage'):
+    """Yield messages that are no blocks, and what is said of each: a status has the last one."""
+    refused = (
+        ('an offset', 'layout announces 100 x 2 numbers'),
+        ('10,000 dimensions', '10000 dimensions are not'),
+        ('a label of 1 MB', 'a label of more than 200 characters'),
+        ('300,000 doubles', '300000 numbers in one message'),
+    )
+    messages = dict(odd_messages(150_000))
+    for what, said in refused:
+        (message,) = (m for name, m in messages.items() if name.startswith(what))
+        yield message, said
+    ticks = np.arange(100) / FS
+    for t in (np.full(100, 1e300), ticks[::-1], np.delete(ticks, 50), ticks[:0]):
+        yield to_message(Samples(t, np.zeros(t.size), 'strange', topic)), time_problem(t)
+
+
 def at_rest(g):
     g.wait(lambda: g.status('stage')['state'] == 'idle', 'the stage at rest')
+
+
+def refused_by(g):
+    """Return how many blocks of voltage, and of all topics, the nodes say that they refused."""
+    told = ' '.join(('', g.diagnostics('identifier').get('message', '')))
+    found = re.findall(r' (\d+) messages on (\w+) are no blocks', told)
+    captured = {topic: int(count) for count, topic in found}
+    return (
+        int(g.diagnostics('stage')['refused_malformed']),
+        captured.get('voltage', 0),
+        sum(captured.values()),
+        int(g.diagnostics('model')['unreadable']),
+    )
 
 
 def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
@@ -50,26 +85,8 @@ def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
             lambda node=node: any(s['level'] == '1' for s in g.statuses(node)[seen[node] :]),
             f'{node} to warn',
         )
-    # one after the other: of many at once a status has the last
-    refused = (
-        ('an offset', 'layout announces 100 x 2 numbers'),
-        ('10,000 dimensions', '10000 dimensions are not'),
-        ('a label of 1 MB', 'a label of more than 200 characters'),
-        ('300,000 doubles', '300000 numbers in one message'),
-    )
-    messages = dict(odd_messages(150_000))
-    for what, said in refused:
-        (message,) = (m for name, m in messages.items() if name.startswith(what))
+    for message, problem in refused_messages():
         attack.send('voltage', message)
-        for node in ('stage', 'model'):
-            g.wait(
-                lambda said=said, node=node: any(said in s['text'] for s in g.statuses(node)),
-                f'{node} to say {said!r}',
-            )
-    ticks = np.arange(100) / FS
-    for t in (np.full(100, 1e300), ticks[::-1], np.delete(ticks, 50), ticks[:0]):
-        attack.send('voltage', Samples(t, np.zeros(t.size), 'strange'))
-        problem = time_problem(t)
         for node in ('stage', 'model', 'identifier'):
             g.wait(
                 lambda node=node, said=problem: any(said in s['text'] for s in g.statuses(node)),
@@ -80,7 +97,44 @@ def test_messages_that_are_no_blocks_are_refused_by_everybody(attack):
     assert 'Warning' not in g.handle('model').log + g.handle('identifier').log
     assert max(len(s['text']) for s in g.statuses('stage')) < 2000
     assert max(len(s['text']) for s in g.statuses('model')) < 4000
-    g.wait(lambda: int(g.diagnostics('stage')['refused_malformed']) >= 15, 'refused blocks')
+
+    def counted():
+        by_stage, by_identifier, on_all, by_model = refused_by(g)
+        return 15 <= by_stage == by_identifier and on_all == by_model
+
+    # what one of them refuses is refused, and counted, by all
+    g.wait(counted, 'equal counts of refused blocks')
+
+
+def test_a_reference_that_is_no_block_is_refused_as_a_voltage_is(attack):
+    g = attack.g
+    at_rest(g)
+    g.wait(lambda: g.status('feedforward').get('models') == '1', 'the model of the file')
+    assert g.call('feedforward/start')[0]
+    g.wait(lambda: g.status('feedforward')['state'] == 'ready', 'the right to drive')
+    count = 0
+    # displacement is of use while a reference is followed
+    for topic, about in (
+        ('reference', 'a block is refused'),
+        ('displacement', 'a block of displacement is refused'),
+    ):
+        for message, problem in refused_messages(topic):
+            g.publish(topic, message)
+            count += 1
+            g.wait(
+                lambda said=f'{about}: {problem}': any(
+                    said in s['text'] and s['level'] == '1' for s in g.statuses('feedforward')
+                ),
+                f'feedforward to say {about}: {problem}',
+            )
+        said = str(count)
+        g.wait(lambda said=said: g.diagnostics('feedforward')['refused'] == said, 'the count')
+        if topic == 'reference':
+            g.publish(topic, Samples(np.arange(100) / FS, np.zeros(100), 'rest', topic))
+            g.wait(lambda: g.status('feedforward')['state'] == 'tracking', 'the reference')
+    # the result keeps it
+    assert g.finish('feedforward/stop', 'stopped')['level'] == '1'
+    attack.survived('references that are no blocks')
 
 
 @pytest.mark.parametrize('seed', range(3))
