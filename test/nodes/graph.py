@@ -47,6 +47,7 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
@@ -221,6 +222,23 @@ class Graph(Observer):
         self.handles.append(new)
         self._heard([new], meanwhile)
         return new
+
+    def load(self, node: str, values: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, Any]]:
+        """
+        Load a file of parameters as ``ros2 param load`` does: all at once, each for itself.
+
+        Return the reasons of what was refused, and what the node holds then.
+        """
+        path = self.folder / 'load.yaml'
+        text = yaml.safe_dump({f'/{node}': {'ros__parameters': dict(values)}}, sort_keys=False)
+        path.write_text(text)
+        client = AsyncParameterClient(self.node, f'/{node}')
+        self.wait(client.services_are_ready, f'the parameters of {node}')
+        future = client.load_parameter_file(str(path))
+        self.wait(future.done, 'the answer')
+        results = zip(values, future.result().results, strict=True)
+        refused = {name: result.reason for name, result in results if not result.successful}
+        return refused, {name: self.get(node, name) for name in values}
 
     def handle(self, name: str) -> Handle:
         """Return the process of a node, the latest one where none is left."""

@@ -4,6 +4,7 @@
 """The stage node as a process, under streams that are in order and others."""
 
 from dataclasses import replace
+import functools
 
 from course import block, column, FS, level
 from graph import Graph, ROOT
@@ -13,7 +14,6 @@ from piezo_ident.model.simulated_stage import SimulatedStage
 from piezo_ident.nodes.wire import STREAM, to_message
 from piezo_ident.record.blocks import Samples
 import pytest
-from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import Float64MultiArray
 import yaml
 
@@ -224,21 +224,7 @@ def test_limits_and_slew_may_be_set_and_hold_at_once(lab):
 
 
 def test_a_file_is_loaded_whatever_the_node_holds(lab):
-    # as ros2 param load sends it: all at once, each to be judged for itself
-    client = AsyncParameterClient(lab.node, '/stage')
-    lab.wait(client.services_are_ready, 'the services')
-    told = len(lab.handle('stage').log)
-
-    def load(values):
-        path = lab.folder / 'load.yaml'
-        text = yaml.safe_dump({'/stage': {'ros__parameters': values}}, sort_keys=False)
-        path.write_text(text)
-        future = client.load_parameter_file(str(path))
-        lab.wait(future.done, 'the answer')
-        results = zip(values, future.result().results, strict=True)
-        refused = {name: result.reason for name, result in results if not result.successful}
-        return refused, {name: lab.get('stage', name) for name in values}
-
+    told, load = len(lab.handle('stage').log), functools.partial(lab.load, 'stage')
     high = {'voltage_low': 20.0, 'voltage_high': 150.0, 'rest': 50.0}
     low = {'voltage_low': -30.0, 'voltage_high': 10.0, 'rest': 0.0}
     before = {name: lab.get('stage', name) for name in high}

@@ -385,3 +385,18 @@ def test_every_yaml_file_loads_into_its_running_node_and_a_bare_off_is_a_choice(
                 assert g.set(node, name, value) == (True, ''), (node, name, value)
         taken, reason = g.set('identifier', 'nice', 6)
         assert not taken and 'read-only' in reason
+        # whatever the node holds: limits that share nothing with those of the file
+        for node in ('excitation', 'feedforward'):
+            for low, rest, high in ((20.0, 50.0, 150.0), (-30.0, -25.0, -20.0)):
+                held = {'voltage_low': low, 'voltage_high': high, 'rest': rest}
+                if node == 'excitation':
+                    # the client of ROS cannot load a text that is YAML itself
+                    held['program'] = str(g.folder / 'held.yaml')
+                    (g.folder / 'held.yaml').write_text(
+                        f'limits: [{low}, {high}]\nrest: {rest}\n'
+                        f'segments:\n  - {{signal: hold, level: {rest}, duration: 1}}\n'
+                    )
+                for wanted in (held, values[node]):
+                    assert g.load(node, wanted) == ({}, wanted)
+            # what was in the way for a moment is no refusal
+            assert 'refused' not in g.handle(node).log
