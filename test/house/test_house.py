@@ -61,7 +61,7 @@ SIZES = {
     'identification/solvers': (800, 5),
     'live': (3800, 16),
     'many': (800, 6),
-    'model': (4400, 19),
+    'model': (4500, 19),
     'nodes': (4000, 18),
     'nodes/identifier': (1400, 7),
     'operators': (1900, 10),
