@@ -109,6 +109,12 @@ def line_between(before: float, after: float, missing: int) -> Array:
     return before + (after - before) * (np.arange(1, missing + 1) / (missing + 1))
 
 
+def lines_between(before: Iterable[float], after: Iterable[float], missing: int) -> Array:
+    """Compute `line_between` for each of k signals, shape (k, missing)."""
+    ends = zip(before, after, strict=True)
+    return np.stack([line_between(*pair, missing) for pair in ends])
+
+
 def robust_range(parts: Iterable[Array]) -> tuple[float, float]:
     """
     Find the smallest and largest of measured numbers, but for wild ones.

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from piezo_ident.common.arrays import Array, Integers, line_between
+from piezo_ident.common.arrays import Array, Integers, lines_between
 from piezo_ident.common.errors import DataError
 from piezo_ident.fitting.adaptation import Adaptation, Learns, Recalled
 from piezo_ident.fitting.attribution import Attribution, percent_change, SURE
@@ -283,8 +283,7 @@ class Corrector:
             )
         elif kind is Kind.GAP and self._last is not None:
             # the predictor bridged this gap by a straight line, too
-            ends = zip(self._last.tolist(), rows[:, 0].tolist(), strict=True)
-            between = np.stack([line_between(*pair, missing) for pair in ends])
+            between = lines_between(self._last, rows[:, 0], missing)
             self._wait(Samples(np.full(missing, np.nan), between[1]), between)
         self._wait(prediction, rows)
         self._last = rows[:, -1]

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from piezo_ident.common.arrays import Array, line_between
+from piezo_ident.common.arrays import Array, line_between, lines_between
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import History, TurningPoints
 from piezo_ident.live.sample_clock import BlockClock, Kind
@@ -300,9 +300,7 @@ class Predictor:
         if missing * self.clock.period > BRIDGE:
             self._clear()
             return
-        now = [past.last for past in self._pasts]
-        ends = zip(now, v1[:, 0].tolist(), strict=True)
-        between = np.stack([line_between(*end, missing) for end in ends])
+        between = lines_between((past.last for past in self._pasts), v1[:, 0], missing)
         self._advance(line_between(t0, t1, missing), between)
         self._lowest = [float('inf')] * len(self._axes)
         if isinstance(self._run, ModesRun):

@@ -12,25 +12,15 @@ node begins anew behind a gap of 0.5 s.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from piezo_ident.common.arrays import Array, line_between
+from piezo_ident.common.arrays import Array, lines_between
 from piezo_ident.model.observer import HORIZON, Observed, Observer
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.record.readings.gaps import follows, played_before
 from piezo_ident.record.record import Piece
-
-
-@dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Voltage [V], free run, displacement and motion by other axes [m], shapes (n,)."""
-
-    v: Array
-    free: Array
-    y: Array
-    felt: Array
 
 
 def observe(model: StageModel, piece: Piece, horizon: int = HORIZON, **options: Any) -> Observed:
@@ -88,39 +78,27 @@ def observe_pieces(
     if model.is_static:
         model = replace(model, sample_rate=pieces[0].sample_rate)
     observer = Observer(model, horizon=horizon, **options)
-    past, done = np.full(horizon, np.nan), list[Observed]()
-    before: _Stretch | None = None
+    past, last, done = np.full(horizon, np.nan), np.empty(0), list[Observed]()
 
-    def follow(piece: _Stretch) -> Observed:
+    def follow(rows: Array, y: Array) -> Observed:
         nonlocal past
-        y = np.concatenate([past, piece.y - piece.felt])
-        past = y[piece.v.size :]
-        seen = observer.process(piece.v, piece.free - piece.felt, y[: piece.v.size])
-        return replace(seen, estimate=seen.estimate + piece.felt)
+        v, run, other = rows
+        y = np.concatenate([past, y - other])
+        past = y[v.size :]
+        seen = observer.process(v, run - other, y[: v.size])
+        return replace(seen, estimate=seen.estimate + other)
 
     for k, piece in enumerate(pieces):
-        stretch = _Stretch(piece.v, free[k], piece.measured, felt[k])
-        missing = 0 if before is None else follows(pieces[k - 1], piece)
-        if before is not None and missing:
-            played = played_before(pieces[k - 1], piece)
-            gap = _between(before, stretch, missing)
-            follow(gap if played is None else replace(gap, v=played.v))
+        rows = np.stack([piece.v, free[k], felt[k]])
+        missing = follows(pieces[k - 1], piece) if k else 0
+        if missing:
+            # straight lines, as in the model node
+            between = lines_between(last, rows[:, 0], missing)
+            if played := played_before(pieces[k - 1], piece):
+                between[0] = played.v
+            follow(between, np.full(missing, np.nan))
             if played is None:
                 observer.lose_memory()
-        done.append(follow(stretch))
-        before = stretch
+        done.append(follow(rows, piece.measured))
+        last = rows[:, -1]
     return done
-
-
-def _between(one: _Stretch, other: _Stretch, missing: int) -> _Stretch:
-    """Fill a gap by straight lines, as the model node does; its displacement is missing."""
-
-    def line(before: Array, after: Array) -> Array:
-        return line_between(float(before[-1]), float(after[0]), missing)
-
-    return _Stretch(
-        line(one.v, other.v),
-        line(one.free, other.free),
-        np.full(missing, np.nan),
-        line(one.felt, other.felt),
-    )
