@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -91,11 +92,11 @@ class FreeRun(Showable):
         Level of the band; None without a band.
     half_widths : tuple of ndarray
         Half width of the band of each piece [m], infinite where nothing is known.
-    estimate : tuple of ndarray
-        Displacement of each piece by an observer, from rest and displacement that is at least
-        `piezo_ident.model.observer.HORIZON` samples older [m]; the model node gives the same.
-    errors_of_estimate : FreeRunErrors or None
-        Errors of `estimate` over all samples; None without an estimate.
+    alone : StageModel or None
+        Axis without the motion by other axes, which the observer of `estimate` corrects; None
+        without an estimate.
+    coupled : bool
+        Whether `model` adds the motion by other axes to that of `alone`.
 
     Examples
     --------
@@ -116,8 +117,8 @@ class FreeRun(Showable):
     warnings: tuple[str, ...] = ()
     interval: float | None = None
     half_widths: tuple[Array, ...] = ()
-    estimate: tuple[Array, ...] = ()
-    errors_of_estimate: FreeRunErrors | None = None
+    alone: StageModel | None = None
+    coupled: bool = False
 
     @property
     def inside(self) -> float:
@@ -133,6 +134,38 @@ class FreeRun(Showable):
     def predicted(self) -> Array:
         """Predicted displacement of all pieces [m], shape (n,)."""
         return np.concatenate(self.pieces)
+
+    @cached_property
+    def estimate(self) -> tuple[Array, ...]:
+        """
+        Displacement of each piece by an observer [m], as by the model node; empty without `alone`.
+
+        The observer begins at rest, and uses displacement that is at least
+        `piezo_ident.model.observer.HORIZON` samples old.
+        """
+        if self.alone is None:
+            return ()
+        record, groups = self.record, connected_pieces(self.record)
+        rest, at_rest = list(self.pieces), [None] * len(groups)
+        if any(self.estimated):
+            rest = _predicted(self.model, record, groups, at_rest)
+        felt = [np.zeros(y.size) for y in rest]
+        if self.coupled:
+            own = _predicted(self.alone, record, groups, at_rest)
+            felt = [y - y_own for y, y_own in zip(rest, own, strict=True)]
+        done: list[Array] = []
+        for pieces in groups:
+            cut = slice(len(done), len(done) + len(pieces))
+            seen = observe_pieces(self.alone, pieces, rest[cut], felt[cut])
+            done += [one.estimate for one in seen]
+        return tuple(done)
+
+    @cached_property
+    def errors_of_estimate(self) -> FreeRunErrors | None:
+        """Errors of `estimate` over all samples; None without an estimate."""
+        return (
+            _errors(self.record, self.estimate, [0] * len(self.pieces)) if self.estimate else None
+        )
 
     @property
     def measured(self) -> Array:
@@ -181,29 +214,6 @@ def compared(
         errors_after_start=_errors(record, predicted, late) if _judged(record, late) else None,
         warnings=(*warnings, *model.extrapolation(record)),
     )
-
-
-def with_estimate(run: FreeRun, alone: StageModel, *, coupled: bool = False) -> FreeRun:
-    """
-    Add the estimate of an observer to a run.
-
-    `alone` is the model that the observer corrects.  `coupled` says whether the model of the run
-    adds the motion by other axes to that of `alone`.
-    """
-    record, groups = run.record, connected_pieces(run.record)
-    rest, at_rest = list(run.pieces), [None] * len(groups)
-    if any(run.estimated):
-        rest = _predicted(run.model, record, groups, at_rest)
-    felt = [np.zeros(y.size) for y in rest]
-    if coupled:
-        own = _predicted(alone, record, groups, at_rest)
-        felt = [y - y_own for y, y_own in zip(rest, own, strict=True)]
-    estimate: list[Array] = []
-    for pieces in groups:
-        cut = slice(len(estimate), len(estimate) + len(pieces))
-        estimate += [one.estimate for one in observe_pieces(alone, pieces, rest[cut], felt[cut])]
-    errors = _errors(record, estimate, [0] * len(estimate))
-    return replace(run, estimate=tuple(estimate), errors_of_estimate=errors)
 
 
 def same_part_errors(*runs: FreeRun) -> list[FreeRunErrors]:

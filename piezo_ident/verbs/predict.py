@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from numbers import Real
 from typing import overload
 
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import DataError, expect
 from piezo_ident.model.axis_records import axis_record, is_measured
-from piezo_ident.model.free_run import compared, FreeRun, with_estimate
+from piezo_ident.model.free_run import compared, FreeRun
 from piezo_ident.model.free_run import free_run as run_axis
 from piezo_ident.model.free_run import predict as predict_axis
 from piezo_ident.model.initial_memory import unknown_starts
@@ -104,7 +105,7 @@ def free_run(
     if not isinstance(model, MultiAxisModel):
         run = run_axis(model, record)
         own_motion = without_other_axes(model)
-        run = with_estimate(run, own_motion, coupled=own_motion.effects != model.effects)
+        run = replace(run, alone=own_motion, coupled=own_motion.effects != model.effects)
         if interval is None:
             return run
         own = half_widths(model, run.record, run.pieces, interval, run.estimated)
@@ -127,7 +128,7 @@ def free_run(
             for axis, one in kept.items()
         }
         single = alone(model)
-        runs = {a: with_estimate(x, single[a]) for a, x in runs.items()}
+        runs = {a: replace(x, alone=single[a]) for a, x in runs.items()}
         if interval is not None:
             half = modes_half_widths(model, model.modes, seen, predicted, interval)
             runs = {a: with_half_widths(x, interval, half[a]) for a, x in runs.items()}
