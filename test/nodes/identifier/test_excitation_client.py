@@ -152,6 +152,13 @@ def test_a_cancel_before_the_answer_to_the_start_stops_no_program_of_others(acce
     assert client.left is None and client.stop() == 'the excitation was not started'
 
 
+def poll_for(client, clock, seconds):
+    """Let time pass on the clock, with a poll every 50 ms."""
+    for _ in range(round(seconds / 0.05)):
+        clock[0] += 0.05
+        client.poll()
+
+
 def test_a_cancelled_start_whose_answer_is_lost_is_stopped_once(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(excitation_client.time, 'monotonic', lambda: clock[0])
@@ -160,9 +167,7 @@ def test_a_cancelled_start_whose_answer_is_lost_is_stopped_once(monkeypatch):
     client.stop()
     for state, stops in (('idle', 0), ('running', 1), ('running', 1)):
         hear(client, state)
-        for _ in range(50):
-            clock[0] += 0.05
-            client.poll()
+        poll_for(client, clock, 2.5)
         assert stopper.calls == stops
     assert programs(setter) == ['a program', 'mine']
     # a late answer stops nothing that somebody has started since
@@ -179,9 +184,7 @@ def test_a_program_long_after_a_lost_start_is_of_somebody_else(monkeypatch):
     client.stop()
     for state in ('idle', 'running'):
         hear(client, state)
-        for _ in range(500):
-            clock[0] += 0.05
-            client.poll()
+        poll_for(client, clock, 25.0)
         assert stopper.calls == 0
     # the answer would still tell
     (asked,) = starter.waited_for
