@@ -20,7 +20,7 @@ from piezo_ident.record.readings.jumps import AROUND, least_step, wild_readings
 
 #: time for which a block waits for its partner [s]
 WAIT = 2.0
-#: length of waiting blocks beyond which both streams count as one run of the clock [s]
+#: length of a stream without a pair beyond which both streams count as one run of the clock [s]
 CATCH_UP = 1.0
 #: largest number of waiting blocks
 MOST = 500
@@ -46,17 +46,21 @@ class Matched:
 
 
 class _Side:
-    """One of two streams: its clock, its waiting blocks, and the number of the clock's run."""
+    """
+    One of two streams: its clock, its waiting blocks, and the number of the clock's run.
+
+    `alone` is the time by the clock, less twice the time in pairs, and at least zero [s].
+    """
 
     def __init__(self) -> None:
         self.clock = BlockClock()
         self.waiting: list[Samples] = []
-        self.run = 0
+        self.run, self.alone = 0, 0.0
 
-    @property
-    def span(self) -> float:
-        """Time between the oldest and the newest waiting block [s]."""
-        return float(self.waiting[-1].t[-1] - self.waiting[0].t[0]) if self.waiting else 0.0
+    def met(self, count: int) -> None:
+        """Note the number of samples of a pair."""
+        # fmax: without a period a pair ends the time alone
+        self.alone = float(np.fmax(self.alone - 2.0 * count * self.clock.period, 0.0))
 
     def forget(self) -> int:
         """Drop blocks that have waited too long; return their number of samples."""
@@ -106,7 +110,9 @@ class Matcher:
         return [Matched(a.t, a.values, b.values, b.segment) for a, b in pairs]
 
     def _match(self, new: Samples, own: _Side, other: _Side) -> list[tuple[Samples, Samples]]:
+        before = own.clock.last
         kind, _ = own.clock.judge(new.t)
+        own.alone += np.fmax(own.clock.last - before, 0.0)
         if kind is Kind.START:
             own.waiting.clear()
             if not own.clock.restarts or other.run > own.run:
@@ -115,8 +121,8 @@ class Matcher:
             else:
                 own.run += 1
         pairs, rest = [], new
-        if own.run != other.run and own.span > CATCH_UP:
-            # one stream was silent when the clock restarted
+        if own.run != other.run and own.alone > CATCH_UP:
+            # one stream was silent at a restart, or two publishers were taken for a restart
             own.run = other.run = max(own.run, other.run)
         for one in list(other.waiting) if own.run == other.run else ():
             if not rest.t.size:
@@ -127,6 +133,8 @@ class Matcher:
             _, i, j = np.intersect1d(rest.t, one.t, return_indices=True)
             if i.size:
                 pairs.append((_rows(rest, i), _rows(one, j)))
+                own.met(i.size)
+                other.met(i.size)
             left, rest = _without(one, j), _without(rest, i)
             if left.t.size:
                 other.waiting.append(left)

@@ -329,6 +329,20 @@ def test_streams_find_together_after_one_was_silent_at_a_restart():
     assert pairs and pairs[-1].t[-1] == 17_999 / RATE
 
 
+def test_short_loops_find_together_after_two_publishers_were_taken_for_restarts():
+    matcher, met = Matcher(), []
+    matcher.predicted(block(0, 3000))
+    for first in (0, 600, 0, 600, 0, 600):
+        matcher.measured(block(first, 600))
+    # each loop is shorter than what both streams wait for
+    for _ in range(4):
+        met.append(0)
+        for k in range(0, 5000, 100):
+            matcher.predicted(block(k, 100))
+            met[-1] += len(matcher.measured(block(k, 100)))
+    assert met[0] == 0 and met[-1] == 50
+
+
 def test_preview_bins_hold_mean_least_and_largest():
     preview = Preview(50.0)
     t = np.arange(600) / RATE
