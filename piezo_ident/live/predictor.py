@@ -37,7 +37,8 @@ from piezo_ident.record.blocks import Samples, time_problem
 from piezo_ident.record.record import Piece
 from piezo_ident.uncertainty.band import band_of, BandStream, KEY
 
-#: longest gap that a straight line bridges; a longer gap starts a new run [s]
+#: longest gap that a straight line bridges [s]; a longer gap starts a new run, because a stage
+#: ramps to rest after this default `silence`
 BRIDGE = 0.5
 #: share of the voltage range that counts as its lower end; a stage there has a known memory
 REST = 0.01

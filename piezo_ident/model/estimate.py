@@ -5,8 +5,9 @@
 Estimate the displacement of a measured record by an observer, as the model node does live.
 
 The free run begins at rest, as in the node, and depends on the voltage alone.  The observer uses
-displacement at least a horizon before the estimated sample.  A gap of up to 1 s is bridged; the
-node begins anew behind a gap of 0.5 s.
+displacement at least a horizon before the estimated sample.  A gap of up to 1 s is bridged, as
+the voltage may go on unrecorded.  The node begins anew behind a gap of 0.5 s, as a stage then
+ramps to rest.
 """
 
 from __future__ import annotations
