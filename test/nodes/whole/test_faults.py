@@ -273,9 +273,11 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     # about the bias the prediction does not know the memory; the estimate does after 50 ms
     g.wait(lambda: estimate[-1].t[-1] == rest[-1].t[-1], 'the estimates')
     n = sum(b.segment == 'noise' for b in rest)
-    late = [b for b in estimate[before:] if b.t[0] >= rest[0].t[0]]
-    streams = late, rig.prediction[count:], rig.answers[-len(rest) :]
-    seen, free, y = (column(blocks[1:n])[1] for blocks in streams)
+    streams = estimate[before:], rig.prediction[count:], rig.answers[-len(rest) :]
+    # a block of the estimate may come in parts
+    begin, end = rest[1].t[0], rest[n - 1].t[-1]
+    rows = ((t >= begin) & (t <= end) for t in (column(blocks)[0] for blocks in streams))
+    seen, free, y = (column(b)[1][row] for b, row in zip(streams, rows, strict=True))
     off, lost = (np.sqrt(np.mean((x - y) ** 2)) for x in (seen, free))
     # the sensor alone makes 1.6 nm
     assert off < 5e-9 and lost > 1e-7, (off, lost)
