@@ -56,7 +56,7 @@ SIZES = {
     'effects': (3100, 23),
     'excitation': (1100, 6),
     'export': (700, 5),
-    'fitting': (1800, 9),
+    'fitting': (1800, 10),
     'identification': (4400, 18),
     'identification/solvers': (800, 5),
     'live': (3800, 16),
@@ -71,7 +71,7 @@ SIZES = {
     'record/tables': (1400, 7),
     'report': (2100, 10),
     'report/figures': (1500, 8),
-    'residual': (2000, 12),
+    'residual': (2000, 11),
     'selection': (300, 4),
     'uncertainty': (900, 12),
 }

@@ -10,14 +10,14 @@ circle is refused, so a stable start stays stable.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import IdentificationError
+from piezo_ident.fitting.damped import descend, Schedule
 from piezo_ident.fitting.modes.frequency_response import frequency_response, LineResponse
 from piezo_ident.fitting.modes.periods import percent_of, PeriodicRecord
 from piezo_ident.fitting.modes.subspace import subspace
@@ -30,44 +30,8 @@ ORDER_GAIN = 0.02
 THIN = 3
 #: steps of each order that is tried
 STEPS = 6
-#: tries of a step, and factor of the damping between two (taste)
-TRIES, FACTOR = 8, 6.0
-#: a fit ends after so many steps in turn that gain less than this share of the error (taste)
-SLOW, SLOW_STEPS = 3e-3, 3
-
-T = TypeVar('T')
-
-
-def descend(
-    model: T,
-    cost: Callable[[T], float],
-    equations: Callable[[T], tuple[Array, Array]],
-    step: Callable[[T, Array, Array, float], T],
-    iterations: int,
-) -> T:
-    """
-    Lower a cost by the steps of Levenberg and Marquardt.
-
-    `equations` gives J'J and J'e of a model, and `step` moves a model by them and a damping.  A
-    model of infinite cost, which runs away, comes back as it is.
-    """
-    now, damping, slow = cost(model), 1e-3, 0
-    for _ in range(iterations if np.isfinite(now) else 0):
-        hessian, gradient = equations(model)
-        before = now
-        for _ in range(TRIES):
-            tried = step(model, hessian, gradient, damping)
-            if (tried_cost := cost(tried)) < now:
-                model, now = tried, tried_cost
-                break
-            damping *= FACTOR
-        else:
-            break
-        damping = max(damping / FACTOR, 1e-9)
-        slow = slow + 1 if before - now < SLOW * before else 0
-        if slow == SLOW_STEPS:
-            break
-    return model
+#: damping of the steps, and the end of a fit (taste)
+SCHEDULE = Schedule(1e-3, 1e-9, worse=6.0, better=(1.0, 6.0), tries=8, slow=3e-3, slow_steps=3)
 
 
 def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:
@@ -91,13 +55,14 @@ def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Mo
         both, flat = np.hstack([columns.real, columns.imag]), error(now).ravel()
         return both @ both.T, both @ np.concatenate([flat.real, flat.imag])
 
-    def step(now: Modal, hessian: Array, gradient: Array, damping: float) -> Modal:
+    def step(now: Modal, normal: tuple[Array, Array], damping: float) -> Modal:
+        hessian, gradient = normal
         size = np.sqrt(np.diag(hessian)) + 1e-30
         damped = hessian / np.outer(size, size) + damping * np.eye(len(hessian))
         return _moved(now, -np.linalg.solve(damped, gradient / size) / size, limit)
 
     start = replace(model, blocks=resolved(model.blocks, limit))
-    return descend(start, cost, equations, step, iterations)
+    return descend(start, cost, equations, step, SCHEDULE, iterations)
 
 
 def choose_order(

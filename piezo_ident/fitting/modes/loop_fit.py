@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
-from piezo_ident.fitting.modes.linear_fit import descend, moved_blocks
+from piezo_ident.fitting.damped import descend
+from piezo_ident.fitting.modes.linear_fit import moved_blocks, SCHEDULE
 from piezo_ident.fitting.modes.periods import PeriodicRecord
 from piezo_ident.model.modes.kernels import CHUNK, KINDS, Passage, sensitivities
 from piezo_ident.model.modes.modal import Modal, narrowest, RADIUS
@@ -158,7 +159,7 @@ def loop_fit(
     model = _ranged(model, records)
     with ThreadPoolExecutor(WORKERS) as pool:
         problem = _Problem(model, records, Parameters.of(model, hold=hold, still=still), pool)
-        model = descend(model, problem.cost, problem.equations, problem.step, iterations)
+        model = descend(model, problem.cost, problem.equations, problem.step, SCHEDULE, iterations)
     return _ranged(model, records)
 
 
@@ -253,9 +254,10 @@ class _Problem:
         return hessian, gradient
 
     def step(
-        self, model: SharedModes, hessian: Array, gradient: Array, damping: float
+        self, model: SharedModes, equations: tuple[Array, Array], damping: float
     ) -> SharedModes:
         """Return the model one damped step on; real poles that would get too slow stay."""
+        hessian, gradient = equations
         size = np.sqrt(np.diag(hessian))
         size = np.where(size > 0, size, 1)
         size = np.maximum(size, 1e-9 * size.max())

@@ -19,7 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
+from piezo_ident.fitting.damped import descend, Schedule
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
@@ -27,8 +29,8 @@ from piezo_ident.operators.dynamics import Dynamics, filter_arx
 RADIUS = 0.99999
 #: number of samples whose products are summed at once
 STRETCH = 1024
-#: the refinement ends if the loss falls by less than this share
-SLOW = 1e-7
+#: damping of the steps, and the end of the refinement
+SCHEDULE = Schedule(1e-3, 1e-12, worse=4.0, better=(1.0, 10.0), most=1e8, slow=1e-7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,8 @@ def _fill_rows(S: Array, x: Array, z: Array, x_at: int, z_at: int, n: int) -> No
 
 
 Stretches = list[tuple[int, int]]
+#: model with the errors of its free run
+Point = tuple[Dynamics, list[Array]]
 
 
 def _mean(x: Array, stretches: Stretches) -> float:
@@ -205,34 +209,27 @@ def output_error(
     """
     na, nb = start.a.size, start.b.size
     problem = _Problem(stretches, na, nb)
-    model = start
-    errors = problem.errors(model)
-    loss, damping = problem.loss(errors), 1e-3
-    for _ in range(maxiter):
-        tick()
-        H, g = problem.normal(model, errors)
+
+    def loss(point: Point) -> float:
+        return problem.loss(point[1])
+
+    def normal(point: Point) -> tuple[Array, Array]:
+        return problem.normal(*point)
+
+    def step(point: Point, equations: tuple[Array, Array], damping: float) -> Point:
+        (model, _), (H, g) = point, equations
         diagonal = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         scaled = H / np.outer(diagonal, diagonal)
-        accepted = False
-        while damping < 1e8:
-            step = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
-            trial = Dynamics(a=model.a + step[:na], b=model.b + step[na:])
-            if trial.is_within(RADIUS):
-                new_errors = problem.errors(trial)
-                new = problem.loss(new_errors)
-                if new < loss:
-                    accepted = True
-                    break
-            damping *= 4.0
-        if not accepted:
-            break
-        fall = 1.0 - new / loss
-        model, loss, errors = trial, new, new_errors
-        damping = max(damping / 10.0, 1e-12)
-        if fall < SLOW or loss == 0.0:
-            break
-    H, _ = problem.normal(model, errors)
+        delta = np.linalg.solve(scaled + damping * np.eye(na + nb), g / diagonal) / diagonal
+        trial = Dynamics(a=model.a + delta[:na], b=model.b + delta[na:])
+        if not trial.is_within(RADIUS):
+            raise ModelError('dynamics: unstable')
+        return trial, problem.errors(trial)
+
+    first = start, problem.errors(start)
+    end = descend(first, loss, normal, step, SCHEDULE, maxiter, tick)
+    H, _ = problem.normal(*end)
     covariance = np.asarray(
-        loss / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
+        loss(end) / problem.n * np.linalg.pinv(H / problem.n, 1e-14, hermitian=True)
     )
-    return OutputErrorFit(model, covariance)
+    return OutputErrorFit(end[0], covariance)
