@@ -4,14 +4,10 @@
 """
 Build the normal equations of blocks, cross-validate by them, and solve for the steps of a fit.
 
-Each block k has ``A_k = M_k' M_k``, ``b_k = M_k' e_k`` and ``s_k = e_k' e_k``.  A set of blocks is
-left out by a subtraction, and its error follows without the samples:
-
-    theta = (sum_train A + D)^-1 sum_train b,     E_k = s_k - 2 b_k' theta + theta' A_k theta.
-
-The steps are Gauss-Newton steps with the damping of Levenberg and Marquardt.  The damping follows
-the ratio of the actual gain of a step to its predicted gain: D. W. Marquardt, J. Soc. Indust.
-Appl. Math. 11(2), 1963, pp. 431-441, doi:10.1137/0111030.
+`piezo_ident.fitting.equations` describes normal equations and their sets of blocks.  The steps are
+Gauss-Newton steps with the damping of Levenberg and Marquardt.  The damping follows the ratio of
+the actual gain of a step to its predicted gain: D. W. Marquardt, J. Soc. Indust. Appl. Math.
+11(2), 1963, pp. 431-441, doi:10.1137/0111030.
 """
 
 from __future__ import annotations
@@ -19,29 +15,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 import itertools
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers, Mask
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.rows import centred, Rows
-from piezo_ident.fitting.equations import bounded_step
+from piezo_ident.fitting.equations import bounded_step, NormalEquations
 
 #: share of a column's own energy that is added to the diagonal: it keeps collinear columns small
 RIDGE = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
-    """Normal equations of k residuals by blocks: (blocks, p, p), (blocks, p, k), (blocks, k)."""
-
-    A: Array
-    b: Array
-    s: Array
-
-    def only(self, chosen: Mask | Integers) -> NormalEquations:
-        """Select some columns by a mask of shape (p,), or by their places."""
-        return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +109,7 @@ def summed(equations: NormalEquations, pull: Pull | None) -> tuple[Array, Array]
 def _held_out(
     equations: NormalEquations, sets: Integers, prior: Array, pull: Pull | None
 ) -> Iterator[tuple[Mask, Array]]:
-    """Yield each set of blocks, and the coefficients that follow from the other sets."""
-    A, b = summed(equations, pull)
-    for one in np.unique(sets):
-        out = sets == one
-        if not out.all():
-            A_out, b_out = equations.A[out].sum(axis=0), equations.b[out].sum(axis=0)
-            yield out, solve(A - A_out, b - b_out, prior)
+    return equations.solved_without(sets, *summed(equations, pull), partial(solve, prior=prior))
 
 
 def held_out_errors(
@@ -142,10 +120,7 @@ def held_out_errors(
 
     Blocks with the same number in `sets`, shape (blocks,), are left out together.
     """
-    errors = equations.s.copy()
-    for out, theta in _held_out(equations, sets, prior, pull):
-        errors[out] += np.sum(theta * (equations.A[out] @ theta - 2.0 * equations.b[out]), axis=1)
-    return np.maximum(errors, 0.0)
+    return np.maximum(equations.errors(_held_out(equations, sets, prior, pull)), 0.0)
 
 
 def held_out_residual(

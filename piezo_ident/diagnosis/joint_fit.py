@@ -26,7 +26,6 @@ from piezo_ident.diagnosis.equations import (
     held_out_residual,
     KEPT,
     next_damping,
-    NormalEquations,
     Pull,
     right_sides,
     Scale,
@@ -48,6 +47,7 @@ from piezo_ident.diagnosis.state import (
     State,
     with_known,
 )
+from piezo_ident.fitting.equations import NormalEquations
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 P = ParamSpec('P')

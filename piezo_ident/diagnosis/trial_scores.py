@@ -29,19 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.diagnosis.criteria import SHOWS, STANDARD_ERRORS
-from piezo_ident.diagnosis.equations import (
-    held_out_errors,
-    normal_equations,
-    NormalEquations,
-    solve,
-    with_columns,
-)
+from piezo_ident.diagnosis.equations import held_out_errors, normal_equations, solve, with_columns
 from piezo_ident.diagnosis.joint_fit import Fitted
 from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.effects import Effect, Trial, View
 from piezo_ident.effects.trials import number_of
+from piezo_ident.fitting.equations import NormalEquations
 from piezo_ident.residual.stretches import block_means, rests
 from scipy.ndimage import uniform_filter1d
 

@@ -15,6 +15,7 @@ A set of blocks is left out by a subtraction, and its error needs no samples:
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,45 +31,43 @@ UNDERCUT, CUTS = 1e-7, 40
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class NormalEquations:
     """
     Normal equations of p parameters in n_b blocks.
 
-    A, b and s have shapes (n_b, p, p), (n_b, p) and (n_b,); `rows` counts the rows of each block.
+    A, b and s have shapes (n_b, p, p), (n_b, p) and (n_b,).  The b and s of k residuals have
+    shapes (n_b, p, k) and (n_b, k).
     """
 
     A: Array
     b: Array
     s: Array
-    rows: Integers
 
-    def held_out(
-        self,
-        sets: Integers,
-        prior: Array,
-        lower: Array,
-        upper: Array,
-        rising: tuple[Array, Array] | None = None,
-    ) -> Array:
+    def only(self, chosen: Mask | Integers) -> NormalEquations:
+        """Select some columns by a mask of shape (p,), or by their places."""
+        return NormalEquations(self.A[:, chosen][:, :, chosen], self.b[:, chosen], self.s)
+
+    def solved_without(
+        self, sets: Integers, A: Array, b: Array, solve: Callable[[Array, Array], Array]
+    ) -> Iterator[tuple[Mask, Array]]:
         """
-        Predict every block from the other sets, and sum its squared errors; shape (n_b,).
+        Yield each set of blocks as a mask, and the parameters that follow from the other sets.
 
         Blocks with the same number in `sets`, shape (n_b,), are left out together.  Blocks with
-        the number -1 stay in every fit.  The prior, shape (p, p), is the information before the
-        fit.  `bounded_step` describes the bounds and `rising`.
+        the number -1 stay in every fit.  A and b are the sums over all blocks, with the
+        information besides blocks.
         """
-        A, b = self.A.sum(axis=0) + prior, self.b.sum(axis=0)
-        errors = self.s.copy()
         for one in np.unique(sets[sets >= 0]):
             out = sets == one
-            if out.all():
-                continue
-            A_out, b_out = self.A[out], self.b[out]
-            A_in, b_in = A - A_out.sum(axis=0), b - b_out.sum(axis=0)
-            theta = bounded_step(A_in, b_in, lower, upper, rising=rising)
-            errors[out] += np.sum(theta * (A_out @ theta - 2.0 * b_out), axis=1)
-        # far from its minimum the linear prediction fails, and could claim less than the fit error
-        return np.asarray(np.maximum(errors, self.s))
+            if not out.all():
+                yield out, solve(A - self.A[out].sum(axis=0), b - self.b[out].sum(axis=0))
+
+    def errors(self, solved: Iterable[tuple[Mask, Array]]) -> Array:
+        """Sum the squared errors of every block, predicted by `solved_without`; shape of s."""
+        errors = self.s.copy()
+        for out, theta in solved:
+            errors[out] += np.sum(theta * (self.A[out] @ theta - 2.0 * self.b[out]), axis=1)
+        return errors
 
 
 def bounded_step(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 import itertools
 import math
 
@@ -20,7 +20,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.damped import descend, Schedule
-from piezo_ident.fitting.equations import bounded_step, Equations
+from piezo_ident.fitting.equations import bounded_step, NormalEquations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
@@ -46,18 +46,21 @@ class Fit:
     stage : Stage
     loss : float
         Sum of squared residuals over the samples that count, normalised.
-    equations : Equations
+    equations : NormalEquations
         Normal equations at the result, block by block.
+    rows : ndarray of int, shape (blocks,)
+        Number of samples of each block that count.
     """
 
     stage: Stage
     loss: float
-    equations: Equations
+    equations: NormalEquations
+    rows: Integers
 
     @property
     def n(self) -> int:
         """Number of samples that count."""
-        return int(self.equations.rows.sum())
+        return int(self.rows.sum())
 
     @property
     def rms(self) -> float:
@@ -66,13 +69,21 @@ class Fit:
 
     def prior_weight(self) -> Array:
         """Compute the information that the prior adds to the equations, shape (p, p)."""
-        return _prior_weight(self.stage, self.loss, _observations(self.equations.rows))
+        return _prior_weight(self.stage, self.loss, _observations(self.rows))
 
     def held_out(self, sets: Integers) -> Array:
-        """Predict every block from the other sets, and sum its squared errors; shape (n_b,)."""
-        values, (lower, upper) = self.stage.values, self.stage.bounds
-        bounds = lower - values, upper - values
-        return self.equations.held_out(sets, self.prior_weight(), *bounds, self.stage.rising)
+        """
+        Predict every block from the other sets, and sum its squared errors; shape (n_b,).
+
+        `NormalEquations.solved_without` describes the sets.
+        """
+        stage, equations = self.stage, self.equations
+        lower, upper = (bound - stage.values for bound in stage.bounds)
+        solve = partial(bounded_step, lower=lower, upper=upper, rising=stage.rising)
+        A, b = equations.A.sum(axis=0) + self.prior_weight(), equations.b.sum(axis=0)
+        errors = equations.errors(equations.solved_without(sets, A, b, solve))
+        # far from its minimum the linear prediction fails, and could claim less than the fit error
+        return np.asarray(np.maximum(errors, equations.s))
 
     def covariance(self) -> Array:
         """Compute the covariance of the values for white residuals; zero on a bound."""
@@ -118,13 +129,15 @@ def fit(
             'the first guess of the free-run fit diverges on these data; are all values of a '
             'plausible size?'
         )
-    count = _observations(start.equations.rows)
+    blocks = 1 + max(int(s.block[-1]) for s in stretches)
+    rows = np.sum([np.bincount(s.block[s.use], minlength=blocks) for s in stretches], axis=0)
+    count = _observations(rows)
     schedule = replace(SCHEDULE, enough=SLOW * count)
 
     def cost(here: _Point) -> float:
         return _cost(here.loss, count, stage, here.stage.values)
 
-    def step(here: _Point, equations: Equations, damping: float) -> _Point | None:
+    def step(here: _Point, equations: NormalEquations, damping: float) -> _Point | None:
         move, left = _solved(here, equations, count, damping)
         values = here.stage.values + move
         if cost(here) - _cost(left, count, stage, values) < schedule.enough:
@@ -132,7 +145,7 @@ def fit(
         return _Point(here.stage.moved(values), stretches)
 
     end = descend(start, cost, lambda one: one.equations, step, schedule, iterations, tick)
-    return Fit(end.stage, end.loss, end.equations)
+    return Fit(end.stage, end.loss, end.equations, rows)
 
 
 class _Point:
@@ -148,12 +161,11 @@ class _Point:
             self.loss = float(sum(np.sum(e[s.use] ** 2) for e, s in used))
 
     @cached_property
-    def equations(self) -> Equations:
+    def equations(self) -> NormalEquations:
         """Normal equations of all stretches, block by block."""
         stage, count = self.stage, 1 + max(int(s.block[-1]) for s in self._stretches)
         p = stage.values.size
         A, b, total = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros(count)
-        rows = np.zeros(count, dtype=np.int64)
         for s, own, error in zip(self._stretches, self._signals, self._errors, strict=True):
             at = np.flatnonzero(s.use)
             if not at.size:
@@ -169,12 +181,11 @@ class _Point:
                 A[k] += part @ part.T
                 b[k] += part @ e[start:stop]
                 total[k] += e[start:stop] @ e[start:stop]
-                rows[k] += stop - start
-        return Equations(A, b, total, rows)
+        return NormalEquations(A, b, total)
 
 
 def _solved(
-    here: _Point, equations: Equations, count: float, damping: float
+    here: _Point, equations: NormalEquations, count: float, damping: float
 ) -> tuple[Array, float]:
     """
     Solve the linearised equations; return the step and the loss that it promises.

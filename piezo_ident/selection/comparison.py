@@ -64,14 +64,13 @@ def candidate(
     name: str, fit: Fit, sets: Integers, kinds: Integers | None, effects: int = 0
 ) -> Candidate:
     """Rate a fit; `sets` and `kinds` give the set of each block, -1 for blocks without a set."""
-    rows = fit.equations.rows
-    blocks = float(fit.held_out(sets).sum() / rows.sum())
+    blocks = float(fit.held_out(sets).sum() / fit.n)
     if kinds is None:
         return Candidate(name, fit, blocks, blocks, effects)
     out = kinds >= 0
     left = fit.held_out(kinds)
     # only blocks of a kind were held out, so only their errors count
-    return Candidate(name, fit, blocks, float(left[out].sum() / rows[out].sum()), effects)
+    return Candidate(name, fit, blocks, float(left[out].sum() / fit.rows[out].sum()), effects)
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate:
