@@ -27,8 +27,8 @@ class Schedule:
     """
     Damping of the steps, as a share of the energy of each column, and the end of a descent.
 
-    The damping begins at `first`.  A failed step multiplies it by `worse`.  A good step multiplies
-    it by the fraction `better`, numerator and denominator, but keeps it above `least`.
+    The damping begins at `first`.  A failed step multiplies it by `worse`.  A good step divides it
+    by `better`, but keeps it above `least`.
 
     A descent ends after `tries` failed steps in turn, and when the damping reaches `most`.  It
     also ends after `slow_steps` slow steps in turn.  A slow step lowers the cost by less than the
@@ -38,7 +38,7 @@ class Schedule:
     first: float
     least: float
     worse: float
-    better: tuple[float, float]
+    better: float
     tries: int = 100
     most: float = math.inf
     slow: float = 0.0
@@ -80,7 +80,7 @@ def descend(
         else:
             return point
         point = trial
-        damping = max(damping * schedule.better[0] / schedule.better[1], schedule.least)
+        damping = max(damping / schedule.better, schedule.least)
         slow = slow + 1 if before - now < max(schedule.slow * before, schedule.enough) else 0
         if slow == schedule.slow_steps:
             break

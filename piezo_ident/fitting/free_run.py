@@ -24,8 +24,8 @@ from piezo_ident.fitting.equations import bounded_step, NormalEquations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
-#: damping of the steps.  A product with 0.1 differs from a quotient by 10 in its last bit
-SCHEDULE = Schedule(first=1e-4, least=1e-9, worse=5.0, better=(0.1, 1.0), most=1e6)
+#: damping of the steps
+SCHEDULE = Schedule(first=1e-4, least=1e-9, worse=5.0, better=10.0, most=1e6)
 #: the fit ends if a step lowers the loss, or promises to, by less than this share
 SLOW = 1e-4
 #: independent observations in a block, as neighbouring residuals are alike (taste)

@@ -31,7 +31,7 @@ THIN = 3
 #: steps of each order that is tried
 STEPS = 6
 #: damping of the steps, and the end of a fit (taste)
-SCHEDULE = Schedule(1e-3, 1e-9, worse=6.0, better=(1.0, 6.0), tries=8, slow=3e-3, slow_steps=3)
+SCHEDULE = Schedule(1e-3, 1e-9, worse=6.0, better=6.0, tries=8, slow=3e-3, slow_steps=3)
 
 
 def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:

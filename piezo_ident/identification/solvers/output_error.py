@@ -30,7 +30,7 @@ RADIUS = 0.99999
 #: number of samples whose products are summed at once
 STRETCH = 1024
 #: damping of the steps, and the end of the refinement
-SCHEDULE = Schedule(1e-3, 1e-12, worse=4.0, better=(1.0, 10.0), most=1e8, slow=1e-7)
+SCHEDULE = Schedule(1e-3, 1e-12, worse=4.0, better=10.0, most=1e8, slow=1e-7)
 
 
 @dataclass(frozen=True, eq=False)
