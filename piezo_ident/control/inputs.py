@@ -27,8 +27,10 @@ def checked_motion(wanted: ArrayLike) -> Array:
     """Convert a wanted motion to a vector, or raise DataError."""
     y = real_array(wanted, 'invert, wanted motion')
     if y.ndim != 1 or y.size < 2 or not np.all(np.isfinite(y)):
+        bad = np.count_nonzero(~np.isfinite(y))
         raise DataError(
-            'invert: the wanted motion must be a vector of finite numbers, in metres, two at least'
+            f'invert: the wanted motion has the shape {y.shape} and {bad} bad numbers; it must be '
+            'a vector of at least two finite numbers, in metres'
         )
     return y
 
@@ -56,7 +58,10 @@ def checked_limits(
     except (TypeError, ValueError):
         low = high = speed = np.nan
     if not (-np.inf < low < high < np.inf and speed > 0.0):
-        raise DataError('limits must be (lowest, highest) voltage, finite, and a slew above zero')
+        raise DataError(
+            f'limits {limits!r} and slew {slew!r}: the limits must be two finite numbers '
+            '(lowest, highest), and the slew must be above zero'
+        )
     return low, high, speed
 
 

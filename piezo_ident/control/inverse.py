@@ -39,7 +39,7 @@ from piezo_ident.control.inputs import (
     shifted,
     tolerance,
 )
-from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse
+from piezo_ident.control.linear_inverse import linear_inverse, LinearInverse, lowest_mode
 from piezo_ident.control.rate_inverse import RateInverse
 from piezo_ident.effects.amplifier_lag import AmplifierLag
 from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
@@ -352,7 +352,9 @@ def _out_of_reach(task: _Task, best: _Pass, used: slice, missed: Mask, most: flo
     jumps = maximum_filter1d(np.abs(np.diff(x, append=x[-1])), task.near)[missed]
     remedy = ''
     if jumps.max() > JUMPS * task.span:
-        remedy = '; the motion jumps there: round it over two periods of the lowest mode'
+        mode = lowest_mode(task.model)
+        ways = 'slow it down', f'round it over two periods of the lowest mode, {mode:.4g} Hz'
+        remedy = f'; the motion jumps there: {ways[bool(np.isfinite(mode))]}'
     elif np.isinf(slew) and (at_top.all() or not at_top.any()):
         remedy = f'; {shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
     speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'

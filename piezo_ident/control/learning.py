@@ -231,7 +231,7 @@ class Learning:
     def _doubts(self, y: Array) -> Iterator[str]:
         """Yield reasons why a displacement was not measured on this stage under the drive."""
         if not np.ptp(y) and np.ptp(self.drive.v):
-            yield 'the displacement stands still; is the sensor connected?'
+            yield f'the displacement stands still at {1e6 * y[0]:.4g} um; is the sensor connected?'
         if self.repetitions:
             # a learned drive moves the model away from the stage
             return

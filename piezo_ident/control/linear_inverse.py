@@ -166,7 +166,9 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
     """
     gain = model.dynamics.gain
     if gain == 0.0 or not np.isfinite(gain):
-        raise ModelError('this model has no inverse: the static gain of G is zero or infinite')
+        raise ModelError(
+            f'this model has no inverse: G has the static gain {gain:g}; identify again'
+        )
     n = SHORTEST
     # a longer delay would wrap around
     while n < OF_DELAY * model.total_delay.samples:

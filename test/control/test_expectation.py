@@ -38,7 +38,7 @@ def test_a_record_of_slow_motion_promises_nothing_of_fast_motion():
     wanted = scan(10e-6, 30e-6, frequency=50.0)
     drive = pi.invert(model, wanted)
     assert np.std(PAPER.simulate(drive.v)[drive.lead :] - wanted) > 20.0 * drive.expected_rms
-    assert any('fast motion' in text for text in drive.warnings)
+    assert any('steps or noise' in text for text in drive.warnings)
 
 
 @pytest.mark.parametrize(('start', 'size'), [(40e-6, 1e-6), (10e-6, 40e-6), (2e-6, 10e-6)])
@@ -64,7 +64,7 @@ def test_a_stage_that_is_sampled_slowly_has_a_way_to_its_motion():
 
 def test_a_model_without_creep_does_not_tell_where_a_stage_is():
     drive = pi.invert(replace(PAPER, identification=KNOWN), scan(40e-6, 1e-6))
-    assert drive.expected_offset is None and 'unknown, the model has no creep' in repr(drive)
+    assert drive.expected_offset is None and 'no creep' in repr(drive)
     assert drive.expected_rms == pytest.approx(0.0005 * 75e-6)
 
 
@@ -82,24 +82,24 @@ def test_a_motion_that_dips_below_rest_by_less_than_the_stage_errs_by_is_made():
     rest = float(PAPER.simulate([0.0, 0.0])[0])
     known = replace(PAPER, identification=KNOWN)
     dips = scan(rest, 40e-6) - 13e-9
-    with pytest.raises(DataError, match=r'raise the motion by 0\.013 um'):
+    with pytest.raises(DataError, match=r'raise .* 0\.013 um'):
         pi.invert(PAPER, dips)
     assert not pi.invert(PAPER, dips + 13e-9).clipped.any()
     drive = pi.invert(known, dips)
-    assert drive.clipped.any() and 'out of reach' in drive.warnings[0]
+    assert drive.clipped.any() and ' 0 .. 10 V: by up to 0.013 um' in drive.warnings[0]
     assert np.abs(drive.predicted - drive.wanted).max() < 14e-9
     # more than the stage errs by, or much of a small motion
-    for refused in (dips - 50e-9, scan(rest, 0.4e-6) - 13e-9):
-        with pytest.raises(DataError, match='raise the motion by'):
+    for refused, by in ((dips - 50e-9, 0.063), (scan(rest, 0.4e-6) - 13e-9, 0.013)):
+        with pytest.raises(DataError, match=f'raise .* {by} um'):
             pi.invert(known, refused)
 
 
 def test_a_motion_beyond_a_limit_is_told_by_how_much_to_move_it_and_a_jump_is_called_that():
     high = scan(30e-6, 50e-6)
-    with pytest.raises(DataError, match=r'lower the motion by \d\S* um') as refused:
+    with pytest.raises(DataError, match=r'lower .* \d\S* um') as refused:
         pi.invert(PAPER, high)
-    by = float(re.search(r'lower the motion by (\S+) um', str(refused.value))[1])
+    by = float(re.search(r'lower .* (\S+) um', str(refused.value))[1])
     assert not pi.invert(PAPER, high - 1e-6 * by).clipped.any()
     wanted = np.where(np.arange(4000) < 2000, 20e-6, 60e-6)
-    with pytest.raises(DataError, match=r'out of reach .* the motion jumps .*round'):
+    with pytest.raises(DataError, match=r'samples .* jumps .* 600 Hz'):
         pi.invert(with_mode(600.0), wanted)

@@ -69,7 +69,7 @@ def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
         pi.invert(PAPER, wanted)
     drive = pi.invert(PAPER, wanted, clip=True)
     assert drive.v.max() == 10.0 and drive.v.min() >= 0.0
-    assert drive.clipped.any() and 'out of reach' in drive.warnings[0]
+    assert drive.clipped.any() and ' 0 .. 10 V' in drive.warnings[0]
     free = ~drive.clipped
     miss = np.abs(drive.wanted - drive.predicted)
     assert np.median(miss[free]) < 1e-8 < miss[drive.clipped].max()

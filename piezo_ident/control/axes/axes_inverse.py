@@ -50,9 +50,12 @@ class AxesFilter(LinearInverse):
 def static_gain(G: Modal, spans: Array) -> Array:
     """Compute the gain at rest [spans/V]; ModelError if it has no inverse."""
     static = G.response(np.ones(1, complex))[0].real / spans[:, None]
-    if not np.linalg.cond(static) < SINGULAR:
+    condition = np.linalg.cond(static)
+    if not condition < SINGULAR:
         raise ModelError(
-            'these modes have no inverse: at rest, two axes move as one, or one stands still'
+            f'the shared modes have no inverse: their gain at rest has the condition '
+            f'{condition:.3g}, the most is {SINGULAR:g}; two axes move as one, or one stands '
+            'still: diagnose again from a record in which each axis moves alone'
         )
     return np.asarray(static)
 

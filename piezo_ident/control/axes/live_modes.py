@@ -104,7 +104,10 @@ class LiveModesInverse:
         rest: float | None = None,
     ) -> None:
         if model.modes is None:
-            raise ModelError('live inverse: the model has no modes that its axes share')
+            raise ModelError(
+                f'live inverse: the axes {", ".join(axes)} share no modes; make a LiveInverse of '
+                'each axis'
+            )
         if preview < 1:
             raise ModelError(f'a preview of {preview} samples does not look ahead; make it longer')
         # rows of the axes, and columns of the modes in alphabetical order
@@ -155,7 +158,11 @@ class LiveModesInverse:
                 before = error
         best = min(tried, key=lambda one: one[0])
         if not np.isfinite(best[0]):
-            raise ModelError('live inverse: the shared modes run away under the inverse')
+            (low, *_), (high, *_) = self._limits
+            raise ModelError(
+                'live inverse: the shared modes run away on a trial motion within '
+                f'{low:g} .. {high:g} V; give narrower limits, or diagnose again'
+            )
         return best
 
     def _missed(self, passes: list[_Pass], wanted: Array) -> float:

@@ -343,9 +343,11 @@ def _of_axis(task: _Task, j: int, drive: _Drive, late: list[str], clip: bool) ->
     clipped, warnings = drive.near & (np.abs(error) > task.small[j]), list(late)
     if clipped.any():
         most = float(np.abs(error[clipped]).max())
+        low, high = (ends[j] + task.modes.v0[j] for ends in (task.low, task.high))
+        speed = '' if np.isinf(task.step) else f' and at {task.step:g} V/s'
         warnings.append(
             f'{np.count_nonzero(clipped)} samples of the wanted motion of {axis} are out of reach '
-            f'within the limits: by up to {1e6 * most:.3g} um'
+            f'within {low:g} .. {high:g} V{speed}: by up to {1e6 * most:.3g} um'
         )
         if not clip and most > task.tolerances[j]:
             raise DataError(warnings[-1], options='--clip')

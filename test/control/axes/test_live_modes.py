@@ -135,12 +135,12 @@ def test_a_preview_that_is_short_is_told_and_what_makes_no_sense_refused():
     for wrong in (wanted[:1], wanted[:, :0], np.full((2, 5), np.nan)):
         with pytest.raises(pi.DataError, match='2 rows of finite numbers'):
             live.process(wrong)
-    with pytest.raises(pi.ModelError, match='no modes'):
+    with pytest.raises(pi.ModelError, match=r'y, y_b .*LiveInverse'):
         LiveModesInverse(pi.MultiAxisModel(model.axes), AXES[:2])
 
 
 def test_modes_that_run_away_are_refused():
     model, _ = case(3)
     wild = replace(model.modes, e=-300.0 * model.modes.e, levels=0)
-    with pytest.raises(pi.ModelError, match='run away'):
+    with pytest.raises(pi.ModelError, match=r'at sample \d+ of \d+'):
         LiveModesInverse(pi.MultiAxisModel(model.axes, wild), AXES[:2])

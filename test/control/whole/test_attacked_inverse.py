@@ -38,24 +38,24 @@ def circle(radius, angle):
         (SINE * 1e6, {}, r'starts at 1.5e\+07 um; .* in metres\?'),
         (SINE * 1e6, {'clip': True}, r'in metres\?'),
         (SINE + 1j, {}, 'expected real numbers, got complex128; give its real part'),
-        (SINE[None], {}, 'vector of finite numbers'),
-        (SINE[:1], {}, 'two at least'),
-        ('abc', {}, 'wanted motion: expected real numbers'),
-        (np.where(T > 0.1, np.nan, SINE), {}, 'finite'),
-        (np.ma.masked_greater(SINE, 50e-6), {}, 'finite'),
+        (SINE[None], {}, r'shape \(1, 4000\)'),
+        (SINE[:1], {}, r'shape \(1,\)'),
+        ('abc', {}, 'wanted motion: .* <U3'),
+        (np.where(T > 0.1, np.nan, SINE), {}, '1999 bad'),
+        (np.ma.masked_greater(SINE, 50e-6), {}, r'\d+ bad'),
         (-SINE, {}, 'starts at -15 um; between 0 and 10 V the stage rests at 0 .. 71'),
         (SINE, {'sample_rate': 1e4}, 'sampled at 10000 Hz, the model at 20000 Hz'),
-        (SINE, {'limits': (-np.inf, np.inf)}, r'\(lowest, highest\) voltage, finite'),
-        (SINE, {'limits': 10.0}, 'lowest, highest'),
-        (SINE, {'limits': (10.0, 0.0)}, 'lowest, highest'),
-        (SINE, {'limits': ('low', 'high')}, 'lowest, highest'),
-        (SINE, {'limits': (30.0, 40.0)}, 'outside 0 .. 10 V, for which the model holds'),
+        (SINE, {'limits': (-np.inf, np.inf)}, r'limits \(-inf, inf\)'),
+        (SINE, {'limits': 10.0}, 'limits 10.0'),
+        (SINE, {'limits': (10.0, 0.0)}, r'limits \(10.0, 0.0\)'),
+        (SINE, {'limits': ('low', 'high')}, r"limits \('low', 'high'\)"),
+        (SINE, {'limits': (30.0, 40.0)}, 'limits .* 0 .. 10 V'),
         (SINE, {'limits': (5.0, 5.0 + 1e-9)}, 'starts at 15 um; between 5 and 5 V'),
-        (SINE, {'slew': 0.0}, 'a slew above zero'),
-        (SINE, {'slew': None}, 'a slew above zero'),
+        (SINE, {'slew': 0.0}, 'slew 0.0'),
+        (SINE, {'slew': None}, 'slew None'),
         (SINE, {'slew': 1e-12}, r'3959 samples .* at 1e-12 V/s: by up to 40 um'),
         (35e-6 + 20e-9 * np.sin(300 * T), {'slew': 1e-6}, 'by up to 0.02 um'),
-        (np.where(T < 0.1, 20e-6, 50e-6), {}, '5 samples .* by up to 18'),
+        (np.where(T < 0.1, 20e-6, 50e-6), {}, '5 samples .* to 18'),
         (SINE, {'channels': {'axis': np.zeros(5)}}, "channel 'axis' must be a vector of 4000"),
         (SINE, {'channels': {'axis': np.full(4000, np.nan)}}, "channel 'axis'"),
     ],
@@ -70,7 +70,7 @@ def test_what_has_no_inverse_is_named():
     h = Hysteresis(PAPER.hysteresis.thresholds, PAPER.hysteresis.weights, -0.8, 1.1)
     with pytest.raises(ModelError, match=r'no inverse: its slope falls to -1\.3'):
         pi.invert(replace(PAPER, hysteresis=h), SINE)
-    with pytest.raises(ModelError, match='static gain of G is zero'):
+    with pytest.raises(ModelError, match='gain 0;'):
         pi.invert(replace(PAPER, dynamics=Dynamics([0.5], [1.0, -1.0])), SINE)
     with pytest.raises(ModelError, match=r'this model .* 0\.99999'):
         pi.invert(replace(PAPER, dynamics=drifting(0.5)), SINE)
