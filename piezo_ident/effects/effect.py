@@ -114,10 +114,11 @@ class Parameter:
         try:
             number = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise ModelError(f'{where}: {self.name} is not a number') from None
+            text = reprlib.repr(value)
+            raise ModelError(f'{where}: {self.name} is not a number: {text}') from None
         if number.ndim != int(self.vector):
             shape = 'a list of numbers' if self.vector else 'one number'
-            raise ModelError(f'{where}: {self.name} must be {shape}')
+            raise ModelError(f'{where}: {self.name} must be {shape}, got {reprlib.repr(value)}')
         if not np.all((number >= self.lower) & (number <= self.upper)):
             raise ModelError(
                 f'{where}: {self.name} = {number.tolist()} leaves its bounds '

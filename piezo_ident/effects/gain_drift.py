@@ -78,7 +78,7 @@ class GainDrift(Effect):
         super().agree(values)
         time = np.atleast_1d(np.asarray(values['time'], dtype=np.float64))
         if time.size == 0 or np.any(np.diff(time) <= 0):
-            raise ModelError('effect gain_drift: give at least one time, and times that ascend')
+            raise ModelError(f'effect gain_drift: time = {time.tolist()} must ascend')
 
     @classmethod
     def trials(cls, view: View) -> tuple[Trial, ...]:

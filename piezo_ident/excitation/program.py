@@ -285,7 +285,9 @@ def _program(data: Mapping[str, Any], name: str) -> Program:
     if not limits[0] <= values['rest'] <= limits[1]:
         raise ConfigError(f'{name}: rest = {values["rest"]:g} V lies outside the limits {limits}')
     if values['seed'] < 0 or values['seed'] != int(values['seed']):
-        raise ConfigError(f'{name}: seed must be a whole number, not negative')
+        raise ConfigError(
+            f'{name}: seed = {values["seed"]:g} must be a whole number, not negative'
+        )
     items = data.get('segments')
     if not isinstance(items, list) or not items:
         raise ConfigError(f'{name}: segments must be a list with at least one signal')

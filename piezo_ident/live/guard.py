@@ -86,7 +86,10 @@ class GuardSettings:
                 f'{self.low:g} .. {self.high:g} V; move it, or them'
             )
         if not (self.slew > 0 and self.ramp_slew > 0 and self.sample_rate > 0):
-            raise ConfigError('slew, ramp_slew and sample_rate of a guard must be positive')
+            raise ConfigError(
+                f'slew = {self.slew:g} V/s, ramp_slew = {self.ramp_slew:g} V/s and sample_rate = '
+                f'{self.sample_rate:g} Hz must be positive'
+            )
 
     @property
     def step(self) -> float:

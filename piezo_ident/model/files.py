@@ -85,7 +85,7 @@ def number(data: Mapping[str, Any], key: str, name: str, default: float | None =
     """Read a number of a mapping, or raise ModelError; ``2e-5`` counts, though YAML reads text."""
     value = data.get(key, default)
     if isinstance(value, bool) or value is None:
-        raise ModelError(f'{name}: {key} is missing or not a number')
+        raise ModelError(f'{name}: {key} is missing or not a number: {value}')
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):

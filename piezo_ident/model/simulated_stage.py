@@ -293,5 +293,7 @@ def _converter(sensor: Mapping[str, Any], which: str, where: str) -> Converter |
         raise ConfigError(f'give both {bits} and {ends}: [lowest, highest]')
     count, limits = number(sensor, bits, where), numbers(sensor, ends, where)
     if not count.is_integer() or limits.size != 2:
-        raise ConfigError(f'{bits} must be a whole number and {ends} [lowest, highest]')
+        raise ConfigError(
+            f'{bits} = {count:g} must be a whole number, {ends} = {limits.tolist()} two numbers'
+        )
     return Converter(int(count), float(limits[0]), float(limits[1]))

@@ -283,9 +283,9 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
     shape = np.array([numbers({'shape': row}, 'shape', name) for row in rows])
     axes = data.get('axes')
     if not isinstance(axes, list) or len(axes) != 2 or axes[0] or not str(axes[1]).isidentifier():
-        raise ConfigError(f"{name}: axes must be two names, the first of them '', as in ['', b]")
+        raise ConfigError(f"{name}: axes = {axes!r} must be '' and a second name, as in ['', b]")
     if creep.get('axis') not in axes:
-        raise ConfigError(f'{name}: axis of creep must be one of {axes}')
+        raise ConfigError(f'{name}: creep.axis = {creep.get("axis")!r} must be one of {axes}')
     where = f'{name}: hysteresis'
     stage = TwoAxisStage(
         ('', str(axes[1])),
@@ -311,9 +311,12 @@ def _stage(data: Mapping[str, Any], name: str) -> TwoAxisStage:
 
 def _check(stage: TwoAxisStage, name: str) -> None:
     """Refuse impossible values."""
-    h, c, z0 = stage.hysteresis
-    if not np.isfinite([stage.sample_rate, stage.gain, h, c, z0, stage.noise_rms]).all():
-        raise ConfigError(f'{name}: sample_rate, gain, hysteresis and noise_rms must be finite')
+    h, _, z0 = stage.hysteresis
+    values = {
+        key: getattr(stage, key) for key in ('sample_rate', 'gain', 'hysteresis', 'noise_rms')
+    }
+    if bad := [key for key, x in values.items() if not np.isfinite(x).all()]:
+        raise ConfigError(f'{name}: {", ".join(bad)} must be finite')
     sizes: Many[tuple[str, Array, tuple[int, ...]]] = (
         ('frequency', stage.frequency, (2,)),
         ('damping', stage.damping, (2,)),
@@ -326,7 +329,8 @@ def _check(stage: TwoAxisStage, name: str) -> None:
             raise ConfigError(f'{name}: {key} must be {shape} {kind} numbers')
     if not (stage.sample_rate > 2 * stage.frequency.max() and stage.gain != 0):
         raise ConfigError(
-            f'{name}: sample_rate must be above twice the highest mode, and gain not 0'
+            f'{name}: sample_rate = {stage.sample_rate:g} Hz must be above twice the highest '
+            f'mode, {stage.frequency.max():g} Hz, and gain = {stage.gain:g} not 0'
         )
     if abs(np.linalg.det(stage.shape)) < 1e-6:
         raise ConfigError(f'{name}: the rows of shape are the same mode; make them differ')

@@ -97,14 +97,20 @@ class Hysteresis:
         r, q = frozen_array(self.thresholds), frozen_array(self.weights)
         if r.ndim != 1 or r.shape != q.shape:
             raise ModelError(
-                f'hysteresis: {r.size} thresholds and {q.size} weights; give one weight each'
+                f'hysteresis: thresholds of shape {r.shape}, weights of shape {q.shape}; give two '
+                'lists of one length'
             )
         if not (np.isfinite(r).all() and np.isfinite(q).all() and (q >= 0).all()):
+            bad = {'thresholds': ~np.isfinite(r), 'weights': ~(np.isfinite(q) & (q >= 0))}
+            each = [f'{name}[{i}]' for name, x in bad.items() for i in np.flatnonzero(x)]
             raise ModelError(
-                'hysteresis: thresholds and weights must be finite, weights must not be negative'
+                f'hysteresis: {", ".join(each[:8])} must be finite, and weights not negative'
             )
         if np.any(r < 0) or np.any(np.diff(r) <= 0):
-            raise ModelError('hysteresis: thresholds r_i must ascend and not be negative')
+            i = int(np.argmax((r < 0) | (np.diff(r, prepend=-np.inf) <= 0)))
+            raise ModelError(
+                f'hysteresis: thresholds[{i}] = {r[i]:g} is negative, or not above the one before'
+            )
         p2 = float(self.p2)
         if r.size and r[0] == 0.0:
             if self.curves is not None or self.bias is not None:
@@ -112,7 +118,9 @@ class Hysteresis:
             p2 += float(q[0])
             r, q = frozen_array(r[1:].copy()), frozen_array(q[1:].copy())
         if not (np.isfinite(self.p1) and np.isfinite(p2) and np.isfinite(self.p0)):
-            raise ModelError('hysteresis: p0, p1 and p2 must be finite numbers')
+            raise ModelError(
+                f'hysteresis: p0 = {self.p0:g}, p1 = {self.p1:g} and p2 = {p2:g} must be finite'
+            )
         powers = {'p0': float(self.p0), 'p1': float(self.p1), 'p2': p2}
         for name, value in {'thresholds': r, 'weights': q, **powers}.items():
             object.__setattr__(self, name, value)

@@ -241,7 +241,10 @@ class HysteresisLaw:
         """Compute the coefficients of an H, shape (size,); ModelError for another family."""
         h, m = hysteresis, self.thresholds.size
         if not np.array_equal(h.thresholds, self.thresholds):
-            raise ModelError('hysteresis: the law has other thresholds')
+            raise ModelError(
+                f'hysteresis: the {h.thresholds.size} thresholds of H are not the {m} of the law; '
+                'make the law from the thresholds of H'
+            )
         plays = np.zeros((POWERS + 2, m))
         plays[0] = h.weights
         if h.curves is not None:

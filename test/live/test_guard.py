@@ -92,13 +92,13 @@ def test_a_ramp_that_must_end_in_time_is_steeper_but_keeps_the_slew():
 @pytest.mark.parametrize(
     ('change', 'reason'),
     [
-        ({'low': 10.0}, 'crossed'),
-        ({'high': math.nan}, 'crossed'),
-        ({'rest': 11.0}, 'rest = 11 V lies outside'),
-        ({'rest': math.nan}, 'rest'),
-        ({'slew': 0.0}, 'must be positive'),
-        ({'ramp_slew': math.nan}, 'must be positive'),
-        ({'sample_rate': -1.0}, 'must be positive'),
+        ({'low': 10.0}, r'limits 10 \.\. 10 V'),
+        ({'high': math.nan}, r'limits 0 \.\. nan V'),
+        ({'rest': 11.0}, 'rest = 11 V .* 0 .. 10 V'),
+        ({'rest': math.nan}, 'rest = nan V'),
+        ({'slew': 0.0}, '^slew = 0 V/s'),
+        ({'ramp_slew': math.nan}, 'ramp_slew = nan V/s'),
+        ({'sample_rate': -1.0}, 'sample_rate = -1 Hz'),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(change, reason):

@@ -183,15 +183,15 @@ WRONG = {
 #: with what is said of them
 TOLD = [
     *(('schema_version', x, 'schema_version') for x in (0, -1, 1.5, 'one', None, True, [1])),
-    *(('schema_version', x, 'update piezo_ident') for x in (SCHEMA_VERSION + 1, 99)),
-    ('hysteresis.curves', [0.1] * 9, 'list of numbers'),
-    ('hysteresis.curves', [[0.1]], '9 thresholds'),
-    ('hysteresis.curves', [[0.1], [0.1, 0.2]], 'one length'),
-    ('hysteresis.curves', 'none', 'list of numbers'),
-    ('hysteresis.bias', [0.1], '9 thresholds'),
-    ('hysteresis.bias', {}, 'list of numbers'),
-    ('hysteresis.span', [0.0], 'lowest, highest'),
-    ('hysteresis.p0', [1], 'not a number'),
+    *(('schema_version', x, f'schema {x}, .* piezo_ident') for x in (SCHEMA_VERSION + 1, 99)),
+    ('hysteresis.curves', [0.1] * 9, 'hysteresis.curves .*list'),
+    ('hysteresis.curves', [[0.1]], r'curves of shape \(1, 1\) for 9'),
+    ('hysteresis.curves', [[0.1], [0.1, 0.2]], 'hysteresis.curves .*rows'),
+    ('hysteresis.curves', 'none', 'hysteresis.curves .*list'),
+    ('hysteresis.bias', [0.1], r'bias of shape \(1,\) for 9'),
+    ('hysteresis.bias', {}, 'bias .*list'),
+    ('hysteresis.span', [0.0], 'hysteresis.span '),
+    ('hysteresis.p0', [1], r'p0 .*\[1\]'),
 ]
 
 
@@ -205,7 +205,7 @@ def test_wrong_values_are_refused_in_one_line(key, value, says):
     for name in path:
         place = place[name]
     place[last] = value
-    with pytest.raises(ModelError, match=says) as caught:
+    with pytest.raises(ModelError, match=says or None) as caught:
         model_from_dict(d, 'm.yaml')
     assert str(caught.value).startswith('m.yaml')
     assert '\n' not in str(caught.value)

@@ -33,17 +33,17 @@ def test_weight_at_zero_is_folded_into_the_linear_term_and_the_stroke_is_the_pap
 @pytest.mark.parametrize(
     ('r', 'q', 'p1', 'p2', 'says'),
     [
-        ([0.1, 0.2], [0.5], 0, 1, 'one weight each'),
-        ([0.1], [-0.5], 0, 1, 'must not be negative'),
-        ([-0.1], [0.5], 0, 1, 'not be negative'),
-        ([0.2, 0.1], [0.5, 0.5], 0, 1, 'must ascend'),
-        ([0.1, 0.1], [0.5, 0.5], 0, 1, 'must ascend'),
-        ([0.1], [np.nan], 0, 1, 'finite'),
-        ([np.inf], [0.1], 0, 1, 'finite'),
-        ([0.1], [0.1], np.nan, 1, 'finite'),
-        ([0.1], [0.1], 0, np.inf, 'finite'),
-        ([[0.1]], [[0.1]], 0, 1, 'one weight each'),
-        (0.1, 0.1, 0, 1, 'one weight each'),
+        ([0.1, 0.2], [0.5], 0, 1, r'thresholds .*\(2,\), weights .*\(1,\)'),
+        ([0.1], [-0.5], 0, 1, r': weights\[0\] '),
+        ([-0.1], [0.5], 0, 1, r': thresholds\[0\] = -0\.1 '),
+        ([0.2, 0.1], [0.5, 0.5], 0, 1, r': thresholds\[1\] = 0\.1 '),
+        ([0.1, 0.1], [0.5, 0.5], 0, 1, r': thresholds\[1\] = 0\.1 '),
+        ([0.1], [np.nan], 0, 1, r': weights\[0\] '),
+        ([np.inf], [0.1], 0, 1, r': thresholds\[0\] '),
+        ([0.1], [0.1], np.nan, 1, 'p1 = nan'),
+        ([0.1], [0.1], 0, np.inf, 'p2 = inf'),
+        ([[0.1]], [[0.1]], 0, 1, r'thresholds .*\(1, 1\), weights .*\(1, 1\)'),
+        (0.1, 0.1, 0, 1, r'thresholds .*\(\), weights .*\(\)'),
     ],
 )
 def test_what_is_no_hysteresis_is_refused(r, q, p1, p2, says):

@@ -87,7 +87,10 @@ def test_the_limits_hold_for_every_voltage(tmp_path):
 
 @pytest.mark.parametrize(
     ('extra', 'reason'),
-    [({'x_v_b': K}, 'v_b stands there twice|x_v_b stands there twice'), ({'x_v': K}, 'called v')],
+    [
+        ({'x_v_b': K}, 'v_b stands there twice|x_v_b stands there twice'),
+        ({'x_v': K}, 'r.csv: .* v;'),
+    ],
 )
 def test_two_columns_of_one_name_are_refused(tmp_path, extra, reason):
     path = write_csv(tmp_path / 'r.csv', COLUMNS | extra)

@@ -143,10 +143,10 @@ def test_cross_coupling_of_the_rate_is_the_derivative():
 
 def test_cross_coupling_says_which_channel_is_missing_and_what_there_is():
     model, v = with_effects('cross_coupling'), signal()
-    with pytest.raises(ModelError, match="channel 'other_axis'; the data have none"):
+    with pytest.raises(ModelError, match=r"'other_axis'; .*none"):
         model.stream().process(v)
     piece = Piece(v, v, FS, channels={'temperature': v, 'b': v})
-    with pytest.raises(ModelError, match="'other_axis'; the data have b, temperature;"):
+    with pytest.raises(ModelError, match=r"'other_axis'; .* b, temperature;"):
         free_run(model, Record((piece,)))
 
 
@@ -234,7 +234,7 @@ def test_changes_of_the_delay_add_up_and_one_below_nothing_is_refused():
     assert model.total_delay == Delay(4)
     assert_array_equal(played(model, v), played(replace(PAPER, delay=Delay(4)), v))
     model = replace(PAPER, effects=(EffectSetting('delay_change', {'samples': -3.1}),))
-    with pytest.raises(ModelError, match=r'3 samples cannot change by -3\.1'):
+    with pytest.raises(ModelError, match=r'\b3 samples .* -3\.1'):
         model.stream()
 
 
