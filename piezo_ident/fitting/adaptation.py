@@ -129,7 +129,7 @@ def check_learns(kind: Learns, shares: bool) -> None:
     if shares and kind == 'hysteresis':
         raise ModelError(
             'adapt: the hysteresis of modes that the axes share is not learnt, because each play '
-            'moves all axes and an axis learns from its own displacement; learn the gain'
+            "moves all axes and an axis learns from its own displacement; set adapt to 'gain'"
         )
 
 

@@ -122,7 +122,8 @@ def fit(
         If no sample counts, or the prediction of the start is not finite.
     """
     if not any(s.use.any() for s in stretches):
-        raise IdentificationError('no sample is left to fit; hold out less')
+        n = sum(s.use.size for s in stretches)
+        raise IdentificationError(f'none of {n} samples is left to fit; hold out less')
     start = _Point(stage, stretches)
     if not np.isfinite(start.loss):
         raise IdentificationError(

@@ -175,8 +175,8 @@ def _refuse_hold(name: str, piece: Piece, span: float, stroke: float) -> None:
             continue
         t = piece.t[[start * window, min(stop * window, piece.n - 1)]]
         cause = 'a position controller was on'
-        if np.ptp(piece.y[(start + 1) * window : stop * window]) == 0.0:
-            cause += ', or the sensor is at its stop, as it reads one value there'
+        if not np.ptp(held := piece.y[(start + 1) * window : stop * window]):
+            cause += f', or the sensor is at its stop, as it reads {1e6 * held[0]:.4g} um there'
         raise IdentificationError(
             f'{name}: from {t[0]:.3g} to {t[1]:.3g} s the voltage moves by {moved:.1%} of '
             f'its range while the position moves by {followed:.2%} of its stroke: {cause}, so the '

@@ -180,16 +180,13 @@ class NoiseSegment(NamedTuple):
 
 
 def noise_segment(run: Run, signal: Array, start: int, stop: int) -> NoiseSegment:
-    """
-    Cut out the noise between two samples, with a signal in place of its input.
-
-    Raises IdentificationError if the voltage or the displacement is constant there.
-    """
+    """Cut out noise with another input; IdentificationError if v or y is constant there."""
     rate = run.piece.sample_rate
-    if np.ptp(run.u[start:stop]) == 0.0 or np.ptp(run.x[start:stop]) == 0.0:
-        raise IdentificationError(
-            f'{run.record}: voltage or displacement is constant in the noise segment'
-        )
+    for name, x in (('voltage', run.u), ('displacement', run.x)):
+        if np.ptp(x[start:stop]) == 0.0:
+            raise IdentificationError(
+                f'{run.record}: the {name} is constant in the noise at {run.piece.t[start]:.4g} s'
+            )
     band = band_of(run, start, stop)
     u, y = (prefilter(x[start:stop], rate, band) for x in (signal, run.x))
     fit = slice(min(500, u.size // 20), u.size - int(END_HELD * u.size))

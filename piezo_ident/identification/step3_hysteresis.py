@@ -262,7 +262,7 @@ def fit_hysteresis(
     inner[:, :m][:, still] = 0.0
     inner[:, :-1][:, ~_independent(inner[:, :-1], law.thresholds.size, m)] = 0.0
     if not np.all(np.isfinite(R)) or np.linalg.norm(inner[:, -1]) == 0.0:
-        raise IdentificationError('hysteresis: the displacement does not move in the data fitted')
+        raise IdentificationError('hysteresis: the displacement does not move; check the sensor')
     lower = law.lower
     # lags of neighbouring rates, fitted without a prior, become large and cancel each other
     pull = np.zeros((law.lags, inner.shape[1]))

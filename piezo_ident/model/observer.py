@@ -295,7 +295,10 @@ class Observer:
         now = self._state.now if self._started else np.zeros(kernel.PLACES)
         n, total, squares = now[kernel.SEEN], now[kernel.SUM_E], now[kernel.SUM_EE]
         if n < STEADY:
-            raise DataError('the displacement is where the estimate has it: no step to accept')
+            raise DataError(
+                f'no step to accept: {n:.0f} measurements in turn are off the estimate, and '
+                f'{STEADY} are needed'
+            )
         step, um = total / n, 1e6 * self.model.scaling.Y
         spread = float(np.sqrt(max(squares / n - step**2, 0.0)))
         if spread > SPREAD * abs(step):

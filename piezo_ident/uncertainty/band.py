@@ -109,7 +109,7 @@ def band_of(model: StageModel) -> PredictionBand:
     """Read the band of a model; raise ModelError if the model carries none."""
     data = model.identification.get(KEY)
     if not isinstance(data, Mapping):
-        raise ModelError('the model carries no prediction band; identify the stage again')
+        raise ModelError(f'{KEY}: is missing in the model; identify the stage again')
     return PredictionBand.from_dict(data)
 
 

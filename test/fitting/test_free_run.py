@@ -131,7 +131,7 @@ def test_deviations_are_those_of_repeated_noise():
 def test_nothing_to_fit_is_refused_and_the_work_can_be_stopped():
     stage = truth()
     [s] = measured(stage)
-    with pytest.raises(IdentificationError, match='hold out'):
+    with pytest.raises(IdentificationError, match=f'none of {N} samples'):
         fit(rough(stage), [s.with_use(np.zeros(N, dtype=bool))])
 
     def stop():

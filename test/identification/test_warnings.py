@@ -4,6 +4,7 @@
 """Each reason where it is true, and where it must not come."""
 
 from dataclasses import replace
+import re
 
 import numpy as np
 from paper_stage import PAPER
@@ -86,7 +87,7 @@ def test_what_h_cannot_hold_is_told_by_its_size():
     even, ends = shape(v, wing, 0.0 * v)
     assert '% of the displacement is even' in even
     assert int(even.partition('%')[0]) > 80
-    assert 'um apart' in ends
+    assert re.search(r'\d um .* \d\S* um ', ends)
     # a model that has the same loop is not blamed for it
     assert len(shape(v, wing, wing)) == 1
 
@@ -146,8 +147,8 @@ def test_a_record_of_many_sweeps_is_not_told_to_sweep_more(linear):
     poor = replace(result, errors=tuple(rows))
     [piece] = record
     for pieces, is_said in (([piece], False), ([piece.cut(0, 260)], True)):
-        [said] = [x for x in warnings_of(poor, [record], pieces) if 'times the fitted error' in x]
-        assert ('drive it more often' in said) == is_said
+        [said] = [x for x in warnings_of(poor, [record], pieces) if 'held-out error' in x]
+        assert bool(re.search(r'range \S+ times', said)) == is_said
 
 
 def test_two_delays_that_were_not_taken_are_not_said_to_be_followed(linear):
@@ -177,39 +178,30 @@ def erring(result, chosen, **held):
     return replace(result, errors=tuple(rows))
 
 
-#: what is changed of a result, words of the reason, and what is said, nothing where it is not so
+#: what is changed of a result, what its reason names, and the sizes in it, '' where it is not so
 OF_FIT = {
-    'gain above': (
-        *(lambda r: slopes(r, 0.85), 'small-signal gain'),
-        'of the noise, 0.85, is not the slope of H at its bias, 0.8 (',
-    ),
-    'gain below': (lambda r: slopes(r, 0.75), 'small-signal gain', 'noise, 0.75, is not'),
-    'gain near': (lambda r: slopes(r, 0.83), 'small-signal gain', ''),
-    'no gain': (lambda r: slopes(r, np.nan), 'small-signal gain', ''),
-    'swarm': (lambda r: flown(r, 2.5), 'the swarm ended', 'ended 25 % of the loss above'),
-    'swarm, polished': (
-        *(lambda r: flown(r, 2.5, polished=True), 'the swarm ended'),
-        'above the least-squares optimum, before polishing',
-    ),
-    'swarm, near': (lambda r: flown(r, 2.01), 'the swarm ended', ''),
-    'swarm, no loss': (lambda r: flown(r, 0.0, optimum=0.0), 'the swarm ended', ''),
-    'no swarm': (lambda r: flown(r, 2.5, swarm_loss=None), 'the swarm ended', ''),
-    'rest': (
-        *(lambda r: erring(r, 0.2, idle=0.5, ramp=0.3), 'lacks an effect'),
-        'by up to 0.5 % of stroke, more than the 0.2 % on the data that chose it',
-    ),
-    'ramp': (lambda r: erring(r, 0.2, ramp=0.41), 'lacks an effect', 'up to 0.41 % of stroke'),
-    'rest, near': (lambda r: erring(r, 0.2, idle=0.39), 'lacks an effect', ''),
-    'driven': (lambda r: erring(r, 0.2, noise=0.5, idle=0.1), 'lacks an effect', ''),
-    'no selection': (lambda r: erring(r, np.nan, idle=0.5), 'lacks an effect', ''),
-    'rounding': (lambda r: erring(r, 1e-13, idle=1e-11), 'lacks an effect', ''),
+    'gain above': (lambda r: slopes(r, 0.85), 'slope of H', r' 0\.85, .* 0\.8 '),
+    'gain below': (lambda r: slopes(r, 0.75), 'slope of H', r' 0\.75, .* 0\.8 '),
+    'gain near': (lambda r: slopes(r, 0.83), 'slope of H', ''),
+    'no gain': (lambda r: slopes(r, np.nan), 'slope of H', ''),
+    'swarm': (lambda r: flown(r, 2.5), 'swarm', ' 25 %(?!.*polish)'),
+    'swarm, polished': (lambda r: flown(r, 2.5, polished=True), 'swarm', ' 25 %.*polish'),
+    'swarm, near': (lambda r: flown(r, 2.01), 'swarm', ''),
+    'swarm, no loss': (lambda r: flown(r, 0.0, optimum=0.0), 'swarm', ''),
+    'no swarm': (lambda r: flown(r, 2.5, swarm_loss=None), 'swarm', ''),
+    'rest': (lambda r: erring(r, 0.2, idle=0.5, ramp=0.3), 'joint', r' 0\.5 % .* 0\.2 % '),
+    'ramp': (lambda r: erring(r, 0.2, ramp=0.41), 'joint', r' 0\.41 % .* 0\.2 % '),
+    'rest, near': (lambda r: erring(r, 0.2, idle=0.39), 'joint', ''),
+    'driven': (lambda r: erring(r, 0.2, noise=0.5, idle=0.1), 'joint', ''),
+    'no selection': (lambda r: erring(r, np.nan, idle=0.5), 'joint', ''),
+    'rounding': (lambda r: erring(r, 1e-13, idle=1e-11), 'joint', ''),
 }
 
 
 def told(texts, words, said):
     """Return whether a reason is given once, with what is said; not at all where that is empty."""
-    found = [text for text in texts if words in text]
-    return len(found) == bool(said) and all(said in text for text in found)
+    found = [text for text in texts if re.search(words, text)]
+    return len(found) == bool(said) and all(re.search(said, text) for text in found)
 
 
 @pytest.mark.parametrize('name', OF_FIT)
@@ -222,10 +214,10 @@ def test_a_reason_of_the_fit_is_told_where_it_is_so(linear, name):
 def test_labels_that_mean_nothing_are_named_and_others_are_let_be(linear):
     record, result = linear
     [piece] = record
-    near = 'nothing here: triangl (did you mean triangle?)'
+    near = r' triangl .* triangle\?'
     for label, said in (('triangl', near), ('triangle', ''), ('my part', '')):
         labelled = Record((replace(piece, segments=(Segment(label, 0, 100),)),))
-        assert told(warnings_of(result, [labelled], [piece]), 'labels that mean nothing', said)
+        assert told(warnings_of(result, [labelled], [piece]), 'label', said)
 
 
 def run_of(v, label=None):
@@ -241,13 +233,13 @@ V, EARLY, ALWAYS = 10.0 * SINE, T < 1.0, T >= 0.0
 @pytest.mark.parametrize(
     ('fitted', 'use', 'said'),
     [
-        (V < 8.0, ALWAYS, 'covers 0 .. 7.99 V, the held-out part 8.01 .. 10 V: '),
-        (V > 3.0, ALWAYS, 'covers 3.01 .. 10 V, the held-out part 0 .. 2.99 V: '),
+        (V < 8.0, ALWAYS, r' 0 .. 7\.99 V, .* 8\.01 .. 10 V'),
+        (V > 3.0, ALWAYS, r' 3\.01 .. 10 V, .* 0 .. 2\.99 V'),
         (V < 9.95, ALWAYS, ''),
         (V > 0.05, ALWAYS, ''),
         (EARLY, ALWAYS, ''),
         # readings that were lost tell nothing, and are not judged
-        (EARLY, ~EARLY | (V < 8.0), 'covers 0 .. 7.99 V, the held-out part 0 .. 10 V: '),
+        (EARLY, ~EARLY | (V < 8.0), r' 0 .. 7\.99 V, .* 0 .. 10 V'),
         (V < 8.0, V < 8.05, ''),
         (EARLY, EARLY, ''),
     ],
@@ -263,33 +255,33 @@ def test_extrapolation_is_told_of_what_is_held_out_beyond_the_fitted_part(fitted
         # 60 blocks of which one in five is held out
         (2, 2000, None, 'plays', ''),
         (2, 2000, 7, 'plays', ''),
-        (130, 2000, None, 'plays', 'the number of thresholds could not be chosen and is 10'),
+        (130, 2000, None, 'plays', 'thresholds .* 10'),
         (130, 2000, 7, 'plays', ''),
         # other parts chose the law, and it has thresholds of its own
         (130, 2000, None, 'preisach', ''),
         # a block of one sample shows no turn
-        (2, 60, None, 'plays', 'or has too few samples'),
+        (2, 60, None, 'plays', 'thresholds .* 10'),
     ],
 )
 def test_thresholds_that_no_triangle_could_choose(sweeps, size, count, law, said):
     v = 10.0 * np.abs((np.arange(size) * sweeps / size + 1.0) % 2.0 - 1.0)
     held = excerpts_of([run_of(v, 'triangle')], 'triangle', held=True)
-    assert told(warn_of_thresholds(held, count, law), 'turns too often', said)
+    assert told(warn_of_thresholds(held, count, law), 'triangle', said)
 
 
 @pytest.mark.parametrize(
     ('lowest', 'highest', 'said'),
-    [(0.0, 0.8, 'reaches 0 .. 8 V'), (0.03, 1.0, 'reaches 0.3 .. 10 V'), (0.008, 0.992, '')],
+    [(0.0, 0.8, ' 0 .. 8 V'), (0.03, 1.0, r' 0\.3 .. 10 V'), (0.008, 0.992, '')],
 )
 def test_a_triangle_that_does_not_cover_the_record_is_told(lowest, highest, said):
-    assert told(warn_of_triangle(lowest, highest, SCALING), 'does not cover', said)
+    assert told(warn_of_triangle(lowest, highest, SCALING), 'triangle', said)
 
 
 @pytest.mark.parametrize(
-    ('offset', 'said'), [(3e-8, 'lies 0.03 um from'), (-3e-8, 'lies -0.03 um from'), (1.9e-8, '')]
+    ('offset', 'said'), [(3e-8, r' 0\.03 um'), (-3e-8, r' -0\.03 um'), (1.9e-8, '')]
 )
 def test_a_zero_that_moved_is_told_by_its_size(offset, said):
     for Y in (SCALING.Y, -SCALING.Y):
         texts = warn_of_zeros({('one', 0.0): offset, ('two', 0.0): 0.0}, replace(SCALING, Y=Y))
-        assert told(texts, 'one: its zero of displacement', said)
+        assert told(texts, 'one: .*zero', said)
         assert len(texts) == bool(said)

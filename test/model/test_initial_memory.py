@@ -4,6 +4,7 @@
 """The unknown memory at the start of a record."""
 
 from dataclasses import replace
+import re
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -199,7 +200,7 @@ def test_creep_of_earlier_motion_is_estimated(v0):
     # noise of 0.02 %; without the estimate 0.4 to 1 %, and 0.06 to 0.1 % without the mean
     assert run.errors_after_start.percent < 0.04
     assert run.errors_after_start.percent_without_offset < 0.025
-    assert any('creep of earlier motion goes on' in text for text in run.warnings)
+    assert any(re.search('creep .* %', text) for text in run.warnings)
     # a model without creep has none that could go on
     assert not any('creep' in text for text in still.warnings)
 

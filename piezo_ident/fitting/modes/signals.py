@@ -27,7 +27,9 @@ THRESHOLDS = (0.05, 0.15, 0.4, 1.0, 2.0)
 def with_softening(model: SharedModes, records: Sequence[PeriodicRecord]) -> SharedModes:
     """Let the extensions of the actuators soften the stage; their level is 1 in the records."""
     if model.signals:
-        raise ModelError('softening comes before the plays')
+        raise ModelError(
+            f'the model has {model.signals} signals of plays already; call with_softening first'
+        )
     new = _with(model, *_extension(model), records, plays=False)
     return replace(new, levels=new.signals)
 

@@ -236,7 +236,10 @@ class SharedModes:
         loop = self.loop
         done = trajectory(v, loop, LoopState.at_zero(loop) if state is None else state, run)
         if done < n:
-            raise ModelError(f'the shared modes run away at sample {done} of {n}')
+            raise ModelError(
+                f'the shared modes run away at sample {done} of {n}; make the motion smaller, or '
+                'diagnose again'
+            )
         return run
 
 
@@ -262,12 +265,16 @@ def modes_from_dict(data: Any, axes: int, name: str) -> SharedModes:
         }  # fmt: skip
         # a list without rows has lost its number of columns
         arrays = {x: np.array(data[x], dtype=np.float64).reshape(s) for x, s in shapes.items()}
-        sound = all(np.isfinite(x).all() for x in arrays.values())
-        sound = sound and all((arrays[x] > 0).all() for x in ('memory', 'taus'))
+        low, high = map(float, arrays['range'])
+        within = {
+            'blocks': n % 2 == 0, 'memory': arrays['memory'] > 0, 'taus': arrays['taus'] > 0,
+            'levels': 0 <= arrays['levels'] <= q, 'range': 0 <= low <= 1 <= high,
+        }  # fmt: skip
+        sound = {x: np.isfinite(z) & within.get(x, True) for x, z in arrays.items()}
+        if wrong := [x for x, each in sound.items() if not np.all(each)]:
+            raise ValueError(f'{", ".join(wrong)} out of range')
+        del arrays['range']
         levels, memory = int(arrays.pop('levels')), float(arrays.pop('memory'))
-        low, high = map(float, arrays.pop('range'))
-        if not sound or n % 2 or not 0 <= levels <= q or not 0 <= low <= 1 <= high:
-            raise ValueError('a number is out of range')
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f'{name}: modes: {error!r}; see docs/two_axes.md') from None
     linear = Modal(*(arrays.pop(x.name) for x in fields(Modal)))

@@ -97,5 +97,6 @@ def test_a_model_that_runs_away_says_so_and_a_fit_leaves_it_as_it_is():
     wild = replace(truth, e=-60 * truth.e)
     found = loop_fit(wild, taught, iterations=2)
     assert (found.e == wild.e).all()
-    with pytest.raises(ModelError, match='run away'):
-        wild.steady(stage.multisine(np.random.default_rng(7), 1.5))
+    other = stage.multisine(np.random.default_rng(7), 1.5)
+    with pytest.raises(ModelError, match=r'at sample \d+ of \d+'):
+        wild.steady(other)

@@ -110,7 +110,7 @@ def test_the_live_band_is_the_offline_one():
     offline_bands = bands(model, record, model.predicted(record), 0.8)
     for row, axis in zip(np.hstack(halves), order, strict=True):
         np.testing.assert_array_equal(row, offline_bands[axis][0])
-    with pytest.raises(pi.ModelError, match='no prediction band'):
+    with pytest.raises(pi.ModelError, match=f'{KEY}: '):
         bands(case(12)[0], record, model.predicted(record), 0.8)
 
 
@@ -120,7 +120,7 @@ def test_modes_that_run_away_are_a_problem_of_the_stream():
     predictor = Predictor(AXES)
     predictor.set_model(pi.MultiAxisModel(model.axes, wild))
     answers = [predictor.process(block) for block in blocks(v, RATE, 100)]
-    assert None in answers and 'run away' in predictor.problem
+    assert None in answers and 'at sample' in predictor.problem
 
 
 def test_the_observer_corrects_the_prediction_of_each_axis():
@@ -153,9 +153,7 @@ def test_the_estimate_of_a_record_is_that_of_the_stream():
 
 def test_the_feedforward_of_one_axis_refuses_shared_modes():
     model, settings = case(14, 1)[0], GuardSettings(0.0, 10.0, 1e4, 100.0, 0.0, RATE)
-    with pytest.raises(
-        pi.ModelError, match=r'^feedforward of one axis: cannot run the modes'
-    ) as no:
+    with pytest.raises(pi.ModelError, match=r'^feedforward of one axis: ') as no:
         prepared(model, AXES[:1], settings, 9, 'off', None)
     assert 'MultiAxisModel(model.axes)' in str(no.value)
 
@@ -252,7 +250,7 @@ def test_the_gain_of_each_coupled_axis_is_learnt(tmp_path):
 
 
 def test_the_hysteresis_of_shared_modes_is_not_learnt():
-    with pytest.raises(pi.ModelError, match='an axis learns from its own displacement'):
+    with pytest.raises(pi.ModelError, match=r"adapt: .*hysteresis .*'gain'"):
         Corrector(adapt='hysteresis').set_model(alone(coupled().model)['y'], None)
 
 
@@ -262,7 +260,7 @@ def test_modes_that_run_away_end_the_drive_and_the_ramp_goes_on(follow):
     tracker, y0 = coupled().tracker(follow, model), model.modes.y0[:, None]
     tracker.process(np.repeat(y0, 4000, axis=1), restarted=True)
     top = y0 + np.array([[1e-4], [0.0]])
-    with pytest.raises(pi.ModelError, match='run away'):
+    with pytest.raises(pi.ModelError, match=r'at sample \d+ of 4000'):
         tracker.process(np.repeat(top, 4000, axis=1))
     # what was played shows the followers the same
     tracker.play(np.full((2, 9000), 11.0))
