@@ -52,7 +52,7 @@ def test_limits_of_voltage_and_speed_are_kept_and_the_goal_is_met_again(seed):
 
 
 def test_an_h_that_falls_is_refused():
-    with pytest.raises(ModelError, match=r'no inverse: its slope falls to -0\.4'):
+    with pytest.raises(ModelError, match=r'inverse: .*slope .* -0\.4'):
         HysteresisInverse(Hysteresis([0.1], [0.1], -0.8, 2.0))
     # no line stands for a wide play
     with pytest.raises(ModelError, match=r'falls to -0\.05 at 0 V'):

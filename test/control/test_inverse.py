@@ -65,7 +65,7 @@ def test_any_stable_g_has_an_inverse_that_looks_ahead(seed):
 
 def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
     wanted = 30e-6 + 60e-6 * np.sin(np.arange(4000) / 400.0) ** 2
-    with pytest.raises(DataError, match=r'samples .* out of reach within 0 .. 10 V: by up to 1\d'):
+    with pytest.raises(DataError, match=r'samples .* 0 .. 10 V: .* 1\d'):
         pi.invert(PAPER, wanted)
     drive = pi.invert(PAPER, wanted, clip=True)
     assert drive.v.max() == 10.0 and drive.v.min() >= 0.0
@@ -77,7 +77,7 @@ def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
         pi.invert(PAPER, sine(120.0), slew=100.0)
     slow = pi.invert(PAPER, sine(120.0), slew=100.0, clip=True)
     assert np.abs(np.diff(slow.v)).max() <= 100.0 / FS * (1 + 1e-9)
-    with pytest.raises(DataError, match='starts at 100 um; between 0 and 10 V the stage rests at'):
+    with pytest.raises(DataError, match=r' 100 um; .* 0 and 10 V .* um'):
         pi.invert(PAPER, np.full(10, 100e-6))
 
 

@@ -70,7 +70,7 @@ def test_a_model_that_falls_is_refused_by_all_with_the_same_words(capsys, law, t
     path, scan, header = (tmp_path / name for name in ('model.yaml', 'scan.csv', 'stage.h'))
     falls = reread(falls, path)
     wanted = np.full(100, 20e-6)
-    with pytest.raises(ModelError, match=r'slope falls to -\d.* at \d\S* V') as refused:
+    with pytest.raises(ModelError, match=r'slope .* -\d\S* at \d\S* V') as refused:
         pi.invert(falls, wanted)
     with pytest.raises(ModelError) as live:
         pi.LiveInverse(falls)

@@ -59,7 +59,7 @@ def residual_figure(residual: Residual) -> Figure:
     NothingToDraw when no sample counts.
     """
     if not residual.sound.any():
-        raise NothingToDraw(f'{residual.record}: no sample counts')
+        raise NothingToDraw(f'{residual.record}: none of {residual.sound.size} samples counts')
     piece, stroke = residual.piece, float(np.ptp(residual.piece.y))
     e = {name: getattr(residual, name)[residual.sound] for name, _, _ in STATES}
     limit, _ = style.axis_limit(np.concatenate(list(e.values())))
@@ -288,7 +288,8 @@ def residual_coherence_figure(
     """Draw the coherence of voltage and residual; NothingToDraw when there is too little data."""
     first = before.coherence
     if first is None:
-        raise NothingToDraw('too few samples for a coherence')
+        n = sum(part.piece.n for part in before.parts)
+        raise NothingToDraw(f'{n} samples are too few for a coherence')
     fig = style.figure(2.7)
     axes = fig.subplots()
     shares = []

@@ -133,7 +133,7 @@ def test_a_preview_that_is_short_is_told_and_what_makes_no_sense_refused():
     with pytest.raises(pi.ModelError, match='preview of 0 samples'):
         LiveModesInverse(model, AXES[:2], preview=0)
     for wrong in (wanted[:1], wanted[:, :0], np.full((2, 5), np.nan)):
-        with pytest.raises(pi.DataError, match='2 rows of finite numbers'):
+        with pytest.raises(pi.DataError, match=r'\b2 rows '):
             live.process(wrong)
     with pytest.raises(pi.ModelError, match=r'y, y_b .*LiveInverse'):
         LiveModesInverse(pi.MultiAxisModel(model.axes), AXES[:2])

@@ -68,7 +68,7 @@ def test_what_cannot_be_costs_one_line(wanted, options, line):
 
 def test_what_has_no_inverse_is_named():
     h = Hysteresis(PAPER.hysteresis.thresholds, PAPER.hysteresis.weights, -0.8, 1.1)
-    with pytest.raises(ModelError, match=r'no inverse: its slope falls to -1\.3'):
+    with pytest.raises(ModelError, match=r'inverse: .*slope .* -1\.3'):
         pi.invert(replace(PAPER, hysteresis=h), SINE)
     with pytest.raises(ModelError, match='gain 0;'):
         pi.invert(replace(PAPER, dynamics=Dynamics([0.5], [1.0, -1.0])), SINE)
@@ -117,7 +117,7 @@ def test_limits_beyond_the_identified_range_are_used_as_far_as_h_rises():
     assert 10.0 < drive.v.max() < 11.0 and drive.error < 0.001
     assert 'outside the identified range 0 .. 10 V' in drive.warnings[0]
     # above 11 V the cubic of the paper falls
-    with pytest.raises(DataError, match=r'out of reach within -\d.* \.\. 11\.\d+ V'):
+    with pytest.raises(DataError, match=r'samples .* -\d.* \.\. 11\.\d+ V'):
         pi.invert(PAPER, np.linspace(20e-6, 90e-6, 4000), limits=(-5.0, 15.0))
 
 

@@ -102,5 +102,5 @@ def test_settings_of_a_feed_forward_are_refused():
     assert 'no feed-forward' in pi.export_c(model, limits=None, slew=np.inf, preview=None)
     with pytest.raises(pi.ConfigError, match='preview'):
         pi.export_c(model, preview=20)
-    with pytest.raises(pi.ConfigError, match='no name for C'):
+    with pytest.raises(pi.ConfigError, match="'Stage 1'"):
         pi.export_c(model, 'Stage 1')
