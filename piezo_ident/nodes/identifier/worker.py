@@ -44,7 +44,7 @@ class Worker:
         `EVERY`, and `ended` at the end.
         """
         if self.is_busy:
-            raise PiezoIdentError('another job runs; wait for its end or cancel it')
+            raise PiezoIdentError('another job runs; wait for its end, or call ~/cancel')
         self._cancel.clear()
         self._thread = threading.Thread(
             target=self._run, args=(job, progress, ended), name='worker', daemon=True

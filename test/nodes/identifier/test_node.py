@@ -112,10 +112,10 @@ def made(g, service='identifier/identify'):
 def test_what_cannot_be_done_is_refused_with_the_reason(empty):
     for step in ('identify', 'identify_delay', 'identify_dynamics', 'identify_hysteresis'):
         ok, reason = empty.call(f'identifier/{step}')
-        assert not ok and 'nothing has been captured' in reason
+        assert not ok and '~/run' in reason and 'bag' in reason
     assert empty.call('identifier/cancel') == (False, 'there is no work to cancel')
     ok, reason = empty.call('identifier/save')
-    assert not ok and ('no model to save' in reason or "'output' is empty" in reason)
+    assert not ok and ('~/identify' in reason or "'output'" in reason)
 
 
 @pytest.mark.parametrize(
@@ -182,11 +182,11 @@ def test_each_step_reports_what_it_found(fed):
 def test_save_writes_model_report_and_pictures(fed, tmp_path):
     assert fed.finish('identifier/identify')['state'] == 'done'
     ok, reason = fed.call('identifier/save')
-    assert not ok and "parameter 'output' is empty" in reason
+    assert not ok and "'output'" in reason
     (tmp_path / 'file').write_text('')
     assert fed.set('identifier', 'output', str(tmp_path / 'file'))[0]
     ok, reason = fed.call('identifier/save')
-    assert not ok and 'is a file' in reason
+    assert not ok and str(tmp_path / 'file') in reason
     assert fed.set('identifier', 'output', str(tmp_path / 'out'))[0]
     end = fed.finish('identifier/save')
     assert end['state'] == 'done' and end['text'].startswith('written: '), end
@@ -401,5 +401,5 @@ class Ended(IdentifierNode):
 
 
 def test_work_ends_when_its_outcome_is_taken():
-    with pytest.raises(PiezoIdentError, match='busy: identification'):
+    with pytest.raises(PiezoIdentError, match=r'busy: identification; .*~/cancel'):
         Ended()._clear()

@@ -49,7 +49,7 @@ def test_result_and_progress_are_reported(listener):
 def test_a_second_job_is_refused_and_the_first_cancelled(listener):
     listener.start(tick_for_ever)
     assert listener.started.wait(60.0)
-    with pytest.raises(PiezoIdentError, match='another job'):
+    with pytest.raises(PiezoIdentError, match='~/cancel'):
         listener.start(priority)
     listener.worker.cancel()
     assert listener.worker.join(10.0) and not listener.worker.is_busy
