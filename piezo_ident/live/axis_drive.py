@@ -142,7 +142,10 @@ class AxisDrive:
         """Join the next samples of a reference to a wanted motion [m]."""
         raw = np.asarray(reference, dtype=np.float64)
         if raw.ndim != 1 or not raw.size:
-            raise DataError('a block of a reference is a vector of at least one number')
+            raise DataError(
+                f'a block of a reference has the shape {raw.shape}; give a vector of at least one '
+                'number'
+            )
         if restarted:
             self._join = _Join(self._join.last, self._step())
         self._raw = np.append(self._raw, raw)[-self._preview :]

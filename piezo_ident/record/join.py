@@ -137,14 +137,14 @@ def _without_guarded(joined: Joined, key: str, name: str, met: list[Fault]) -> J
     span = float(np.ptp(finite)) if finite.size else 0.0
     tolerance = TOLERANCE * (span or float(np.abs(finite).max(initial=1.0)))
     wrong = np.abs(v - applied) > tolerance  # False for NaN
-    if wrong.all():
-        raise DataError(
-            f'{name}: the applied voltage is nowhere the commanded one; look at the guards of the '
-            "amplifier's driver"
-        )
     if not wrong.any():
         return joined
     worst = float(np.abs(v - applied)[wrong].max())
+    if wrong.all():
+        raise DataError(
+            f'{name}: the applied voltage is off the commanded one in all {v.size} samples, by up '
+            f"to {worst:.3g} V; look at the guards of the amplifier's driver"
+        )
     begins = np.flatnonzero(wrong & ~np.append(False, wrong[:-1]))
     where = f'{at_times(t[begins])}, by up to {worst:.3g} V'
     count = int(np.count_nonzero(wrong))
@@ -189,7 +189,7 @@ def join(
     high = min(np.nanmax(times[name], initial=-np.inf) for name in streams)
     fewest = min(int(np.count_nonzero((times[k] >= low) & (times[k] <= high))) for k in streams)
     if shared < MET * fewest or not shared:
-        much = f'only {shared} of {fewest} time stamps' if shared else 'no time stamp'
+        much = f'only {shared} of {fewest} time stamps' if fewest else 'no time stamp'
         raise DataError(
             f'{" and ".join(streams)} share {much}; a displacement row must carry the t of '
             'the voltage sample converted on the same tick'

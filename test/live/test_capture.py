@@ -105,7 +105,7 @@ def test_a_voltage_that_is_never_applied_is_refused(record):
         (k, Samples(s.t, s.values + (k == APPLIED), s.segment, s.quantity))
         for k, s in blocks_of(record)
     )
-    with pytest.raises(DataError, match='applied voltage'):
+    with pytest.raises(DataError, match=r'applied .*to 1 V'):
         capture_of(blocks).record()
 
 
@@ -164,9 +164,9 @@ def test_two_publishers_are_no_rows_to_be_sorted(record):
     # two streams of one clock, one of them half a block ahead
     blocks = list(blocks_of(record))
     mixed = [blocks[i ^ 4] if i < 40 else blocks[i] for i in range(len(blocks))]
-    with pytest.raises(DataError, match=r'time is unsorted.*two nodes') as caught:
+    with pytest.raises(DataError, match=r'\d s .* \d\S* s; .* voltage') as caught:
         capture_of(mixed).record()
-    assert 'sort the rows' not in str(caught.value)
+    assert 'rows' not in str(caught.value)
 
 
 def test_a_restart_begins_another_piece(record):
@@ -263,11 +263,11 @@ def test_too_much_missing_in_a_segment_is_refused(record):
     few = without(blocks_of(record), ('voltage', 20))
     refuse_incomplete(capture_of(few).record())
     many = without(blocks_of(record), *(('displacement', k) for k in range(60, 90)))
-    with pytest.raises(DataError, match=r'0\.15 s of 0\.35 s of the noise'):
+    with pytest.raises(DataError, match=r'0\.15 s .* 0\.35 s .* noise'):
         refuse_incomplete(capture_of(many).record())
     # between two segments nobody knows which of them it was
     edge = without(blocks_of(record), *(('displacement', k) for k in range(45, 55)))
-    with pytest.raises(DataError, match=r'0\.05 s of 0\.275 s of the step'):
+    with pytest.raises(DataError, match=r'0\.05 s .* 0\.275 s .* step'):
         refuse_incomplete(capture_of(edge).record())
 
 
@@ -277,7 +277,7 @@ def test_a_stage_that_applies_something_else_is_said(record):
         (key, replace(b, values=np.minimum(b.values, middle)) if key == APPLIED else b)
         for key, b in blocks_of(record)
     ]
-    with pytest.raises(DataError, match=r'did not apply what was commanded, at 0.*limits'):
+    with pytest.raises(DataError, match=r'commanded, at 0.*limits'):
         refuse_incomplete(capture_of(blocks).record())
 
 
@@ -286,7 +286,7 @@ def test_what_is_missing_at_the_ends_shows_beside_the_voltage(record):
     snapshot = capture_of(late).snapshot()
     refuse_incomplete(snapshot.record())
     assert snapshot.sent() == pytest.approx({'step': 0.25, 'noise': 0.35, 'triangle': 0.4})
-    with pytest.raises(DataError, match=r'0\.15 s of 0\.25 s of the step'):
+    with pytest.raises(DataError, match=r'0\.15 s .* 0\.25 s .* step'):
         refuse_incomplete(snapshot.record(), snapshot.sent())
 
 

@@ -131,9 +131,9 @@ def test_before_the_first_block_a_model_is_merely_replaced():
 
 def test_what_does_not_fit_is_refused():
     tracker = Tracker(PAPER, SETTINGS)
-    with pytest.raises(ModelError, match='reference is sampled at 20000 Hz, the model holds for'):
+    with pytest.raises(ModelError, match=r'reference .* 20000 Hz, .* 10000 Hz'):
         tracker.successor(replace(PAPER, sample_rate=10_000.0))
-    with pytest.raises(DataError, match='at least one number'):
+    with pytest.raises(DataError, match=r'reference .*\(0,\)'):
         tracker.process([])
 
 

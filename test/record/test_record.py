@@ -87,6 +87,6 @@ def test_what_needs_a_displacement_refuses_a_voltage_alone():
         lambda: pi.diagnose(model, record),
         lambda: pi.free_run(model, record),
     ):
-        with pytest.raises(DataError, match=r'scan.*no displacement'):
+        with pytest.raises(DataError, match=r'scan: .* displacement; .* prediction'):
             use()
     assert np.isfinite(model.simulate(v)).all()

@@ -127,7 +127,7 @@ def test_a_block_twice_with_other_values_is_refused(tmp_path):
     v, _ = pairs[4]
     messages = interleave(pairs)
     messages.insert(10, ('/voltage', Samples(v.t, v.values + 1, v.segment, v.quantity)))
-    with pytest.raises(DataError, match=r'two different samples of voltage at t = 0\.4 s'):
+    with pytest.raises(DataError, match=r'samples of voltage at t = 0\.4 s'):
         read_bag(write(tmp_path / 'bag', messages))
 
 
@@ -144,7 +144,7 @@ def test_restart_with_the_same_voltage_and_a_lost_block(tmp_path):
 
 def test_streams_that_never_meet_are_refused(tmp_path):
     pairs = [(v, Samples(y.t + 1e-4, y.values, '', y.quantity)) for v, y in blocks()]
-    with pytest.raises(DataError, match='bag: voltage and displacement'):
+    with pytest.raises(DataError, match=r'bag: voltage and displacement .* 0 of \d+'):
         read_bag(write(tmp_path / 'bag', interleave(pairs)))
 
 
@@ -279,7 +279,7 @@ def test_two_stages_need_a_namespace(tmp_path):
         for name, (topic, s) in zip('ab', pair, strict=True)
     ]
     path = write(tmp_path / 'bag', messages)
-    with pytest.raises(DataError, match='/a/voltage, /b/voltage; name the stage'):
+    with pytest.raises(DataError, match=r'/a/voltage, /b/voltage;'):
         read_bag(path)
     for options in (
         {'namespace': '/b'},
@@ -288,9 +288,9 @@ def test_two_stages_need_a_namespace(tmp_path):
     ):
         got = read_bag(path, **options)
         np.testing.assert_array_equal(got.pieces[0].v[:100], b[0][0].values)
-    with pytest.raises(DataError, match="no topic carries 't,voltage' below /c/"):
+    with pytest.raises(DataError, match=r"'t,voltage' .* /c/"):
         read_bag(path, namespace='c')
-    with pytest.raises(DataError, match='no samples on topic /c'):
+    with pytest.raises(DataError, match=r'samples .* /c'):
         read_bag(path, voltage_topic='c')
 
 
@@ -330,7 +330,7 @@ def test_a_sparse_channel_costs_no_other_sample(tmp_path, step, stop, n):
 def test_what_a_model_says_is_not_taken_for_measured(tmp_path, name):
     messages = [m for v, y in blocks() for m in (('/s/voltage', v), (f'/s/{name}', y))]
     path = write(tmp_path / 'bag', messages)
-    with pytest.raises(DataError, match=f'/s/{name}: computed by a model, and no topic carries'):
+    with pytest.raises(DataError, match=rf'/s/{name}: .* measured \w+;'):
         read_bag(path)
     # whoever asks for it gets it
     assert read_bag(path, displacement_topic=f's/{name}').n == 1000
@@ -414,7 +414,7 @@ def test_bag_without_samples(tmp_path):
     path = write(
         tmp_path / 'bag', [('/scan', foreign)], lambda i, data, dims: (data, [Dimension('', 4, 4)])
     )
-    with pytest.raises(DataError, match=r'no topic carries blocks .*topics: /scan'):
+    with pytest.raises(DataError, match=r'blocks .*topics: /scan'):
         read_bag(path)
 
 
@@ -433,6 +433,6 @@ def test_damaged_metadata_and_a_folder_without_a_bag(tmp_path, text):
 
 def test_storage_must_be_known_and_agree(tmp_path):
     for name, storage in (('bag', 'rosbag1'), ('bag.mcap', 'sqlite3')):
-        with pytest.raises(DataError, match='use mcap or sqlite3'):
+        with pytest.raises(DataError, match=r'mcap .*sqlite3'):
             write_bag(record(), tmp_path / name, storage=storage)
     assert not list(tmp_path.iterdir())

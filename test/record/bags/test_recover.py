@@ -97,7 +97,7 @@ def test_sigkill(tmp_path, storage):
     np.testing.assert_array_equal(record.pieces[0].t, t)
     np.testing.assert_array_equal(record.pieces[0].v, 5 + np.sin(t))
     assert 'metadata.yaml is missing' in truncation(record)
-    with pytest.raises(DataError, match=r"'piezo_ident convert .* OUT' saves what is whole"):
+    with pytest.raises(DataError, match=r"'piezo_ident convert .* OUT'"):
         read_bag(tmp_path / 'bag')
     lacking = 'bag.mcap' if storage == 'mcap' else 'transaction that was never finished'
     assert lacking in truncation(record)
@@ -147,7 +147,7 @@ def test_several_files(tmp_path):
         assert sum(c.msgcount for c in bag.connections) == 160
         assert len(list(bag.messages(bag.connections))) == 160
     (folder / 'bag_1.mcap').rename(folder / 'another.mcap')
-    with pytest.raises(DataError, match=r'name one of its files: another\.mcap, bag_0\.mcap'):
+    with pytest.raises(DataError, match=r'files: another\.mcap, bag_0\.mcap'):
         read_bag(folder, recover=True)
 
 

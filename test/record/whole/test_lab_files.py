@@ -295,7 +295,7 @@ def test_units_that_nobody_named_and_that_are_unlikely_are_said(tmp_path):
 
 def test_volts_of_a_sensor_and_of_a_monitor(tmp_path, capsys):
     path = table(tmp_path, 'Zeit (ms),Monitor (mV),Sensor (V)', 1e3 * K / RATE, 50 * V, UM / 10)
-    with pytest.raises(DataError, match='what one V is, as in --displacement-unit 10um'):
+    with pytest.raises(DataError, match=r'V .*--displacement-unit 10um'):
         pi.read(path, columns='y=Sensor (V)')
     given = ['--columns', 'y=Sensor (V)', '--displacement-unit', '10um', '--voltage-unit', '20mV']
     assert main(['convert', *given, str(path), str(tmp_path / 'o.npz')]) == 0
@@ -372,7 +372,7 @@ def test_a_tdms_file_may_hold_channels_of_other_rates(tmp_path):
     slow = ('Temperature', V[:20], 100 / RATE)
     for name, order in (('last.tdms', [slow]), ('alone.tdms', [])):
         assert pi.read(written(name, 1 / RATE, *order)).pieces[0].sample_rate == RATE
-    with pytest.raises(DataError, match=r'v and y are sampled every 0\.0002 s and 0\.002 s'):
+    with pytest.raises(DataError, match=r'v and y .* 0\.0002 s and 0\.002 s'):
         pi.read(written('two.tdms', 10 / RATE))
 
 
@@ -380,7 +380,7 @@ def test_a_tdms_file_that_ends_early_says_so(tmp_path):
     path = tmp_path / 'scan.tdms'
     daq_tdms(path)
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(DataError, match=r'ends early, .* samples in its last segment'):
+    with pytest.raises(DataError, match=r'scan\.tdms: .* \d+ of \d+ samples'):
         pi.read(path)
 
 
@@ -490,7 +490,7 @@ def test_units_are_judged_the_same_way_in_every_format(tmp_path, suffix):
     assert piece.sample_rate == 1000.0
     np.testing.assert_allclose(piece.v, v, rtol=1e-9)
     np.testing.assert_allclose(piece.y, 1e-7 * v, rtol=1e-9)
-    with pytest.raises(DataError, match=r'unit is of a voltage.*--displacement-unit 10um/V'):
+    with pytest.raises(DataError, match=r'--displacement-unit 10um/V'):
         pi.read(path, columns=columns, displacement_unit='um')
 
 
@@ -578,7 +578,7 @@ def test_a_stroke_that_is_none_brings_a_unit_that_is_taken(tmp_path, capsys):
     assert main(shlex.split(shown)) == 0
     np.testing.assert_allclose(pi.read(out).pieces[0].y, 1e-6 * UM, rtol=1e-12)
     # a number that somebody gave is not answered by the same again
-    with pytest.raises(DataError, match='number before the unit') as caught:
+    with pytest.raises(DataError, match='read in 1m,') as caught:
         pi.read(path, displacement_unit='1m')
     assert not caught.value.options
     path.write_text(f't [s],drive [V],pos [um]\n{rows(1e12 + K, V, UM)}')
