@@ -245,14 +245,17 @@ class StageModel(FrontDoor):
         """
         x = real_array(v, 'simulate, voltage')
         if x.ndim != 1 or not np.all(np.isfinite(x)):
+            bad = np.count_nonzero(~np.isfinite(x))
             raise DataError(
-                'simulate: the voltage must be a vector of finite numbers in volts, none masked'
+                f'simulate: the voltage has the shape {x.shape} and {bad} bad or masked numbers; '
+                'it must be a vector of finite numbers in volts'
             )
         if not x.size:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
-        if not all(np.isfinite(z).all() for z in piece.channels.values()):
-            raise DataError('simulate: each channel must be a vector of finite numbers')
+        for name, z in piece.channels.items():
+            if bad := np.count_nonzero(~np.isfinite(z)):
+                raise DataError(f'simulate: the channel {name} has {bad} bad or masked numbers')
         warn_of_unused([self], piece.channels)
         for warning in self.extrapolation(Record((piece,), 'simulate')):
             warnings.warn(warning, stacklevel=2)

@@ -115,7 +115,7 @@ def test_simulate_says_what_a_free_run_says_of_the_voltage(recwarn):
     # an inverse judges its own voltage
     PAPER.inverse(np.full(100, 30e-6))
     assert not recwarn.list
-    with pytest.warns(UserWarning, match=r'25.0% .* outside the identified range') as told:
+    with pytest.warns(UserWarning, match=r'25\.0% .* range') as told:
         PAPER.simulate([0, 5, 10, 12e3])
     # the line of the caller
     assert told[0].filename == __file__
@@ -167,7 +167,7 @@ def test_simulate_starts_from_rest_or_from_the_memory_given():
 
 def test_simulate_takes_real_numbers_without_a_mask():
     v = np.ma.masked_greater(np.linspace(0, 10, 100), 5.0)
-    with pytest.raises(DataError, match='finite numbers'):
+    with pytest.raises(DataError, match=r'voltage .*\(100,\) .* 50 bad'):
         PAPER.simulate(v)
     with pytest.raises(DataError, match=r'voltage: .* complex128'):
         PAPER.simulate(v.data + 1j)
@@ -180,8 +180,8 @@ def test_simulate_takes_real_numbers_without_a_mask():
 
 def test_simulate_warns_of_a_channel_that_nothing_uses():
     v = np.linspace(0, 10, 100)
-    with pytest.warns(UserWarning, match=r'no effect of the model uses the channel heat$'):
+    with pytest.warns(UserWarning, match=r' channel heat$'):
         y = PAPER.simulate(v, channels={'heat': v})
     assert_array_equal(y, PAPER.simulate(v))
-    with pytest.raises(DataError, match='channel must be a vector of finite numbers'):
+    with pytest.raises(DataError, match=r'heat .* 50 bad'):
         PAPER.simulate(v, channels={'heat': np.ma.masked_greater(v, 5.0)})

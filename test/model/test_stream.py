@@ -180,7 +180,7 @@ PAPER_UNDELAYED = replace(PAPER, delay=Delay(0))
 
 
 def test_a_stream_takes_real_numbers_alone():
-    with pytest.raises(DataError, match='stream, voltage: expected real numbers, got complex128'):
+    with pytest.raises(DataError, match=r'stream, voltage: .* complex128'):
         PAPER.stream().process(np.ones(100) + 1j)
     masked = np.ma.masked_greater(np.linspace(0, 10, 100), 9.0)
     assert np.isnan(PAPER.stream().process(masked)[-1])
