@@ -71,7 +71,7 @@ def diagnose(
     hint = 'make them with DiagnosisSettings(...), and give several records as one list'
     expect(settings, DiagnosisSettings, 'diagnose, settings', hint)
     if not records:
-        raise IdentificationError('no record was given')
+        raise IdentificationError('diagnose: no record was given; give one record, or a list')
     for record in records:
         record.require_displacement()
     measured = [without_faults(record) for record in records]

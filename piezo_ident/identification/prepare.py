@@ -182,7 +182,7 @@ class Prepared:
 def prepare(records: Sequence[Record]) -> Prepared:
     """Prepare records; refuse records whose displacement does not answer the voltage."""
     if not records:
-        raise IdentificationError('no record was given')
+        raise IdentificationError('identify: no record was given; give one record, or a list')
     for record in records:
         record.require_displacement()
     measured = [without_faults(record.first(MOST_SAMPLES // len(records))) for record in records]

@@ -12,6 +12,7 @@ from functools import cache
 import importlib
 from itertools import starmap
 import os
+import re
 
 from diagnosis_examples import measured as example_record
 from diagnosis_examples import played, with_effects
@@ -33,7 +34,7 @@ from piezo_ident.identification.identify import identify
 from piezo_ident.identification.results import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
-from piezo_ident.model.metrics import expected_error
+from piezo_ident.model.metrics import expected_error, REVERSED
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
@@ -146,7 +147,7 @@ def test_of_a_long_record_a_stated_part_is_searched_and_fitted():
     most = record.n * 2 // 3
     result = diagnose(slow_model(), record, replace(ONLY_CREEP, most_samples=most))
     assert [e.name for e in result.effects] == ['creep'], result.sentence
-    (warning,) = [w for w in result.warnings if 'samples were searched' in w]
+    (warning,) = [w for w in result.warnings if '--most-samples' in w]
     assert warning.startswith(f'{most:,} of {record.n:,} samples')
     # it is as if the rest were not there
     (piece,) = record
@@ -156,7 +157,7 @@ def test_of_a_long_record_a_stated_part_is_searched_and_fitted():
 
 
 def test_a_setting_of_another_type_is_refused():
-    with pytest.raises(ConfigError, match=r'most_effects must be a whole number, got 1\.5'):
+    with pytest.raises(ConfigError, match=r'most_effects .* 1\.5'):
         DiagnosisSettings(most_effects=1.5)
 
 
@@ -218,12 +219,12 @@ def test_a_refit_to_a_part_of_the_range_holds_there_alone():
     result = diagnose(model, narrow, FEW)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
     assert result.model.scaling.range == (sequence.v.min(), sequence.v.max())
-    assert 'the hysteresis was refitted to 4 .. 6 V alone' in result.warnings[-1]
+    assert re.search(r'hysteresis .* 4 \.\. 6 V', result.warnings[-1])
     # and who leaves that range hears of it
     assert result.model.extrapolation(record)
     whole = diagnosed('creep', 0.3, 1, FEW)
     assert whole.model.scaling.range == model.scaling.range
-    assert not [w for w in whole.warnings if 'was refitted' in w]
+    assert not [w for w in whole.warnings if re.search(r'hysteresis .* V', w)]
 
 
 def test_lines_that_another_axis_makes_are_no_hum():
@@ -278,7 +279,7 @@ def test_the_rest_of_another_axis_is_where_it_stood_at_first():
     (setting,) = result.model.effects
     assert setting.parameters['offset'] == 0.0
     # no part of what follows the other axis is taken for a zero that has moved
-    assert not [warning for warning in result.warnings if 'zero of the displacement' in warning]
+    assert not [warning for warning in result.warnings if re.search(r'zero .* um', warning)]
     assert free_run(result.model, record).errors.percent < 0.01
 
 
@@ -402,7 +403,7 @@ def test_a_refit_beside_a_gain_that_wanders_has_the_given_gain():
     given, refined = (y - y.mean() for y in (given, refined))
     assert np.std(refined - given) > 0.005 * np.std(given)
     assert refined @ given / (given @ given) == pytest.approx(1.0, abs=0.005)
-    assert any('carries the gain of the given one' in warning for warning in result.warnings)
+    assert any(re.match(r'gain_drift .*: .* gain ', warning) for warning in result.warnings)
 
 
 def test_a_gain_drifts_by_the_clock_that_the_model_has_already():
@@ -434,7 +435,7 @@ def test_a_zero_that_was_set_again_is_no_error_and_is_not_kept():
     result, still = diagnose(model, moved, ONLY_CREEP), diagnosed('creep', 0.3, 1, ONLY_CREEP)
     assert result.before.overall == pytest.approx(still.before.overall)
     assert result.after.overall == pytest.approx(still.after.overall, rel=1e-3)
-    assert any('zero of the displacement' in warning for warning in result.warnings)
+    assert any(re.search(r'zero .* 10\S* um', warning) for warning in result.warnings)
     before, after = unseen_errors(result, unseen)
     # the zero of the given model is a little off: it met creep when it was identified
     assert after < 0.7 * before
@@ -446,8 +447,8 @@ def test_a_zero_that_moved_shows_behind_a_large_effect():
     moved = Record((replace(piece, y=piece.y + 1e-6),), 'moved')
     result = diagnose(slow_model(), moved, DiagnosisSettings(effects=('amplifier_lag',)))
     assert [effect.name for effect in result.effects] == ['amplifier_lag']
-    (shift,) = [w for w in result.warnings if 'zero of the displacement has moved by' in w]
-    assert 'by 1 um' in shift and result.before.overall > 1.0 > 0.02 > result.after.overall
+    (shift,) = [w for w in result.warnings if re.search(r'zero .* um', w)]
+    assert ' 1 um' in shift and result.before.overall > 1.0 > 0.02 > result.after.overall
     assert result.model.scaling.y0 == pytest.approx(slow_model().scaling.y0, abs=10e-9)
 
 
@@ -473,7 +474,7 @@ def test_a_refit_of_h_is_kept_beside_hum():
     few = DiagnosisSettings(effects=('periodic_disturbance',))
     result = diagnose(off, record, few)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
-    assert 'it switched off;' not in ' '.join(result.warnings)
+    assert not any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     before, after = unseen_errors(result, unseen)
     # nearly all that is left is hum
     assert before > 3.0 and after < 0.4
@@ -482,7 +483,7 @@ def test_a_refit_of_h_is_kept_beside_hum():
 def test_hum_stays_in_its_record():
     *_, unseen = measured('periodic_disturbance', 0.3, 1, every=1)
     result = diagnosed('periodic_disturbance', 0.3, 1, FEW, every=1)
-    assert 'switched off, and the hysteresis as it was given' in ' '.join(result.warnings)
+    assert any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
     frequency = result.effects[0].parameters['frequency'].value
@@ -536,10 +537,10 @@ REFUSALS = {
     'sampled': lambda p: Piece(p.v[::2], p.y[::2], RATE / 2),
     'longer': lambda p: p.cut(0, 125),
     r'1,000 of .* were searched.*--most-samples': lambda p: p,
-    'changed: the displacement does not follow': lambda p: replace(
+    r'changed: .* \S+ % of': lambda p: replace(
         p, y=1e-6 * np.random.default_rng(1).standard_normal(p.n)
     ),
-    r'changed: .* runs against .* a sign reversed': lambda p: replace(p, y=-p.y),
+    f'changed: {re.escape(REVERSED)}': lambda p: replace(p, y=-p.y),
 }
 
 
@@ -549,7 +550,7 @@ def test_what_cannot_be_diagnosed_is_refused(reason):
     settings = replace(ONLY_CREEP, most_samples=1000) if 'most' in reason else ONLY_CREEP
     with pytest.raises(IdentificationError, match=reason):
         diagnose(model, Record((REFUSALS[reason](record.pieces[0]),), 'changed'), settings)
-    with pytest.raises(IdentificationError, match='no record was given'):
+    with pytest.raises(IdentificationError, match=r'^diagnose: '):
         diagnose(model, [])
 
 
@@ -574,7 +575,7 @@ def test_a_candidate_whose_fit_is_singular_is_left_out_with_a_warning(monkeypatc
     few = DiagnosisSettings(effects=('creep', 'rate_dependent_hysteresis', 'gain_drift'))
     result = diagnose(slow_model(), example_record(), few)
     assert [e.name for e in result.effects] == ['creep'], result.sentence
-    assert any('was not judged' in warning for warning in result.warnings)
+    assert any(warning.startswith('gain_drift ') for warning in result.warnings)
 
 
 def test_columns_that_may_be_swapped_are_said():
@@ -603,7 +604,7 @@ def test_one_pass_over_the_range_names_nothing():
     result = diagnose(model, once, FEW)
     assert not result.effects
     assert result.verdict in ('none', 'unexplained')
-    assert 'no effect could be tested' in result.sentence
+    assert re.search(r'range \S+ times', result.sentence)
     assert 'no candidate' not in result.sentence
 
 

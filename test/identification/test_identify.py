@@ -338,7 +338,7 @@ def test_in_the_end_an_unlabelled_record_is_fitted_whole():
     start, n = (round(t * piece.sample_rate) for t in (3.0, 6.0))
     few = Settings(max_order=5, thresholds=10)
     result = identify(Record((piece.cut(start, n),), 'three seconds'), few)
-    assert 'fitted to all of it' in result.warnings[0]
+    assert re.search(r'three seconds .* 25 %', result.warnings[0])
     e = (piece.y - result.model.simulate(piece.v))[n:]
     unseen = 100.0 * float(np.sqrt(np.mean(e**2)) / np.ptp(piece.y))
     assert unseen <= 0.16
@@ -347,10 +347,10 @@ def test_in_the_end_an_unlabelled_record_is_fitted_whole():
 
 def test_measured_closed_loop_is_refused_whole_and_by_its_ramps_alone():
     record = measured_record('afm_hold.csv')
-    with pytest.raises(IdentificationError, match='position controller'):
+    with pytest.raises(IdentificationError, match=r'afm_hold.*: from \S+ to \S+ s .*its stroke'):
         identify(record)
     for piece in (record.pieces[1], record.pieces[3]):
-        with pytest.raises(IdentificationError, match='straight line'):
+        with pytest.raises(IdentificationError, match=r'ramp: from \S+ to \S+ s .*its travel'):
             identify(Record((piece,), 'ramp'))
 
 
@@ -371,8 +371,8 @@ def test_the_solver_joint_fits_labelled_motion_together():
     v = record.pieces[0].v
     assert_array_equal(result.model.simulate(v), bare.model.simulate(v))
     assert any(row.segment.startswith('triangle') for row in result.errors)
-    assert 'solver joint' in result.warnings[0] and 'no segments' in bare.warnings[0]
-    with pytest.raises(IdentificationError, match='joint has no single steps'):
+    assert 'joint' in result.warnings[0] and 'noise and triangle' in bare.warnings[0]
+    with pytest.raises(IdentificationError, match=r'hysteresis: .* joint'):
         identify(record, joint, steps=Steps())
 
 
@@ -512,7 +512,7 @@ def test_awkward_records_give_a_result_or_a_reason(case):
     assert np.all(np.isfinite(y))
     assert np.ptp(y) < 3 * result.stroke
     assert all(np.isfinite(row.percent) for row in result.errors)
-    assert result.hysteresis.law == 'plays' or 'could not be chosen' not in str(result.warnings)
+    assert result.hysteresis.law == 'plays' or 'thresholds' not in str(result.warnings)
 
 
 @pytest.mark.parametrize(
@@ -548,7 +548,7 @@ def test_segments_in_two_records_are_as_good_as_in_one():
 
 def test_triangle_that_does_not_cover_the_range_warns():
     result = identify(short(text=TALL.replace('step, bias: 5', 'step, bias: 9')), QUICK)
-    assert any('does not cover' in w for w in result.warnings)
+    assert any(re.search(r'triangle .* 6 V', w) for w in result.warnings)
     assert result.model.scaling.range == pytest.approx((0.0, 6.0), abs=0.01)
     wide = free_run(result.model, PAPER.ideal.play(FULL.build()))
     assert wide.warnings
@@ -566,9 +566,9 @@ def test_a_band_is_too_narrow_for_a_g_and_not_for_none(paper):
 
 
 def test_no_record_and_settings_of_another_type_are_refused():
-    with pytest.raises(IdentificationError, match='no record'):
+    with pytest.raises(IdentificationError, match=r'^identify: '):
         identify([])
-    with pytest.raises(DataError, match=r'got dict; make them with Settings\(\.\.\.\)'):
+    with pytest.raises(DataError, match=r'settings: .*dict; .*Settings\('):
         identify(short(), {'thresholds': 4})
 
 
@@ -605,7 +605,7 @@ def test_a_voltage_that_only_carries_its_noise_is_refused(quantum, drift, n=2000
     elif drift == 'with the voltage':
         v = v + 2e-3 * t
     y = 1e-6 * y + 1e-9 * rng.standard_normal(n)
-    with pytest.raises(IdentificationError, match='does not answer the voltage'):
+    with pytest.raises(IdentificationError, match=r'resting: .* V\. .* \S+ % of stroke .* \S+ %'):
         identify(Record((Piece(v, y, 5000.0),), 'resting'), Settings(max_order=4))
 
 
@@ -629,7 +629,7 @@ def test_a_g_that_goes_takes_no_given_delay_along(monkeypatch, delay, used, miss
     assert result.model.dynamics.is_static
     assert result.model.delay.total == result.delay.samples == used
     assert list(dict(result.not_identified)) == [*missing, 'dynamics']
-    assert all('times as much' in why for _, why in result.not_identified)
+    assert all(re.search(r'\d times .* noise', why) for _, why in result.not_identified)
 
 
 @pytest.mark.parametrize('hold_out', [1e-4, 1e-3])
@@ -646,5 +646,5 @@ def test_a_singular_fit_is_an_error_of_ours(monkeypatch):
         raise np.linalg.LinAlgError('Singular matrix')
 
     monkeypatch.setattr('piezo_ident.identification.three_steps.first_step', first_step)
-    with pytest.raises(IdentificationError, match='tell the parameters apart'):
+    with pytest.raises(IdentificationError, match=r'Singular matrix.* triangle'):
         identify(short(), QUICK)
