@@ -254,22 +254,22 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _stop(words: Sequence[str], code: int, text: str, kind: str) -> int:
+    line = ' '.join(text.split('\n'))
+    sys.stderr.write(f'piezo_ident: {"error: " if code == BAD_INPUT else ""}{line}\n')
+    try:
+        if '--json' in words:
+            data = {'kind': kind, 'message': line, 'exit_code': code}
+            sys.stdout.write(f'{json.dumps({"error": data}, indent=2, ensure_ascii=False)}\n')
+        sys.stdout.flush()
+    except OSError:
+        _discard_output()
+    return code
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command, by default with the arguments of the process; return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
-
-    def stop(code: int, text: str, kind: str) -> int:
-        line = ' '.join(text.split('\n'))
-        sys.stderr.write(f'piezo_ident: {"error: " if code == BAD_INPUT else ""}{line}\n')
-        try:
-            if '--json' in words:
-                data = {'kind': kind, 'message': line, 'exit_code': code}
-                sys.stdout.write(f'{json.dumps({"error": data}, indent=2, ensure_ascii=False)}\n')
-            sys.stdout.flush()
-        except OSError:
-            _discard_output()
-        return code
-
     try:
         for name in ('stdout', 'stderr'):
             # None where the caller has closed it: nobody reads
@@ -299,20 +299,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, click.Abort):
         if argv is None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-        return stop(INTERRUPTED, 'interrupted; no output is half written', 'Interrupted')
+        return _stop(words, INTERRUPTED, 'interrupted; no output is half written', 'Interrupted')
     except BrokenPipeError:
         _discard_output()
     except click.UsageError as error:
-        return stop(BAD_INPUT, _told(error), 'UsageError')
+        return _stop(words, BAD_INPUT, _told(error), 'UsageError')
     except PiezoIdentError as error:
         text = str(error)
         if error.options:
             text = text.replace(f', as in {error.options}', '')
             text += f'; for example: piezo_ident {shlex.join(words)} {error.options}'
-        return stop(BAD_INPUT, text, type(error).__name__)
+        return _stop(words, BAD_INPUT, text, type(error).__name__)
     except OSError as error:
         where = f'{error.filename}: ' if error.filename else ''
-        return stop(BAD_INPUT, f'{where}{error.strerror or error}', 'OSError')
+        return _stop(words, BAD_INPUT, f'{where}{error.strerror or error}', 'OSError')
     except MemoryError:
-        return stop(BAD_INPUT, 'out of memory; give fewer or shorter records', 'MemoryError')
+        text = 'out of memory; give fewer or shorter records'
+        return _stop(words, BAD_INPUT, text, 'MemoryError')
     return DONE
