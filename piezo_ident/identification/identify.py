@@ -27,7 +27,7 @@ from piezo_ident.identification.errors import (
     validation_errors,
 )
 from piezo_ident.identification.free_run_fit import fit_free_run
-from piezo_ident.identification.prepare import fault_lines, filled_in, prepare, Run
+from piezo_ident.identification.prepare import fault_lines, filled_in, prepare, Prepared, Run
 from piezo_ident.identification.refusals import refuse_delay
 from piezo_ident.identification.results import FitOutcome, Identification, Steps
 from piezo_ident.identification.settings import Progress, Settings, silent
@@ -88,8 +88,42 @@ def _identify(
 ) -> tuple[Identification, Judged]:
     data = prepare(records)
     validation = [without_faults(record) for record in validation]
-    runs, scaling = data.runs, data.scaling
     refuse_delay(data.pieces, settings.delay)
+    fit = _fitted(data, settings, progress, steps)
+    model, stroke = fit.model, abs(data.scaling.Y)
+    judged, predictions = _predicted(fit, data.runs)
+    floor, shape = noise_floor_of(predictions), warn_of_shape(predictions, data.scaling)
+    result = Identification(
+        model=model,
+        delay=fit.delay,
+        dynamics=fit.dynamics,
+        hysteresis=fit.hysteresis,
+        errors=(*errors_of(predictions, fit.masks), *validation_errors(model, validation)),
+        noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
+        noise_source=floor.source,
+        stroke=stroke,
+        warnings=(*data.warnings, *fault_lines(validation), *fit.warnings, *shape),
+        not_identified=tuple(fit.not_identified),
+        settings=settings,
+        records=(*data.records, *validation),
+        memories=fit.memories,
+    )
+    warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
+    result = replace(result, warnings=warnings)
+    provenance = _provenance(result, records, fast_error(judged, fit.hysteresis.law, data.runs))
+    judged_runs = (
+        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted, p.zero)
+        for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
+    )
+    result = replace(result, model=replace(model, identification=provenance))
+    return result, Judged(tuple(judged_runs), fit.fit)
+
+
+def _fitted(
+    data: Prepared, settings: Settings, progress: Progress, steps: Steps | None
+) -> FitOutcome:
+    """Fit in three steps, or in free run data without labels and for the solver joint."""
+    runs, scaling = data.runs, data.scaling
     in_steps = data.labelled and settings.solver != 'joint'
     if not in_steps and steps is not None:
         own = 'hysteresis: the solver joint has no single steps; identify in one go'
@@ -101,47 +135,16 @@ def _identify(
             return fit_three_steps(runs, data.rate, scaling, settings, progress, steps or Steps())
         return fit_free_run(runs, data.rate, scaling, settings, progress)
 
-    def predicted(fit: FitOutcome) -> tuple[StageModel, list[Prediction]]:
-        judged, memories = fit.judged or (fit.model, fit.memories)
-        return judged, predictions_of(judged, runs, memories, fit.offsets)
-
     fit = fitted(runs)
     if any(piece.sound is not None for piece in data.pieces):
         # fit again with lost readings replaced by the prediction, which is better than a line
-        fit = fitted([filled_in(p.run, p.y_hat, scaling) for p in predicted(fit)[1]])
-    model, stroke = fit.model, abs(scaling.Y)
-    judged, predictions = predicted(fit)
-    floor = noise_floor_of(predictions)
-    result = Identification(
-        model=model,
-        delay=fit.delay,
-        dynamics=fit.dynamics,
-        hysteresis=fit.hysteresis,
-        errors=(*errors_of(predictions, fit.masks), *validation_errors(model, validation)),
-        noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
-        noise_source=floor.source,
-        stroke=stroke,
-        warnings=(
-            *data.warnings,
-            *fault_lines(validation),
-            *fit.warnings,
-            *warn_of_shape(predictions, scaling),
-        ),
-        not_identified=tuple(fit.not_identified),
-        settings=settings,
-        records=(*data.records, *validation),
-        memories=fit.memories,
-    )
-    warnings = (*result.warnings, *warnings_of(result, records, data.pieces))
-    result = replace(result, warnings=warnings)
-    fast = fast_error(judged, fit.hysteresis.law, runs)
-    provenance = _provenance(result, records, fast)
-    judged_runs = (
-        JudgedRun(p.run.record, p.run.piece, p.y_hat, p.judged, ~fitted, p.zero)
-        for p, (fitted, _) in zip(predictions, fit.masks, strict=True)
-    )
-    result = replace(result, model=replace(model, identification=provenance))
-    return result, Judged(tuple(judged_runs), fit.fit)
+        fit = fitted([filled_in(p.run, p.y_hat, scaling) for p in _predicted(fit, runs)[1]])
+    return fit
+
+
+def _predicted(fit: FitOutcome, runs: Sequence[Run]) -> tuple[StageModel, list[Prediction]]:
+    judged, memories = fit.judged or (fit.model, fit.memories)
+    return judged, predictions_of(judged, runs, memories, fit.offsets)
 
 
 def first_steps(
