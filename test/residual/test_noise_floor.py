@@ -3,7 +3,10 @@
 
 """The noise floor: rest and repeats are found, and noise is separated from creep and misfit."""
 
+from itertools import pairwise
+
 import numpy as np
+from numpy.testing import assert_array_equal
 from piezo_ident.common.errors import DataError
 from piezo_ident.record.record import Piece
 from piezo_ident.residual.noise_floor import residual_noise_floor
@@ -18,8 +21,9 @@ def test_stretches_of_a_program_are_found_and_repeats_without_labels():
     # rest, 1 Hz, 50 Hz (40 samples at 2 kHz), noise; four holds start with their first sample
     assert found[:4] == [('rest', 0), ('repeat', 2000), ('repeat', 40), ('motion', 0)]
     assert found[4:8] == [('rest', 0)] * 4
-    kinds = {s.period for s in stretches_of(part_of(np.zeros(V.size), labelled=False))}
-    assert {2000, 40} <= kinds
+    unlabelled = stretches_of(part_of(np.zeros(V.size), labelled=False))
+    assert {2000, 40} <= {s.period for s in unlabelled}
+    assert all(one.stop <= two.start for one, two in pairwise(unlabelled))
 
 
 def test_a_measured_voltage_still_rests_and_repeats():
@@ -39,6 +43,16 @@ def test_a_period_that_is_no_whole_number_repeats_after_several():
     ((start, stop, period),) = find_repeats(v)
     assert (start, period) == (0, 500)
     assert stop == 6000
+
+
+def test_repeats_of_two_periods_meet_and_do_not_overlap():
+    tooth = np.concatenate([np.arange(20.0), np.arange(20.0, 0.0, -1.0)])
+    v = np.concatenate([np.tile(tooth, 10), np.tile(np.append(tooth, np.zeros(20)), 10)])
+    found = find_repeats(v)
+    # the first tooth of the later repeat still belongs to the repeat before it
+    assert [(start, stop) for start, stop, _ in found] == [(0, 441), (441, 1000)]
+    for start, stop, period in found:
+        assert_array_equal(v[start + period : stop], v[start : stop - period])
 
 
 def test_nothing_repeats_where_nothing_comes_back():
