@@ -1,11 +1,13 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The turns of a voltage are found beside its noise."""
+"""Turns of a voltage beside its noise, and the stretches of a search."""
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from piezo_ident.residual.line_spectrum import turns_of
+from piezo_ident.record.record import Piece
+from piezo_ident.residual.line_spectrum import series_of, turns_of
+from piezo_ident.residual.stretches import all_stretches, ResidualPart
 import pytest
 
 RATE = 1000.0
@@ -29,3 +31,13 @@ def test_turns_alternate(least):
     assert np.all(np.diff(turns) > 0)
     assert np.all(np.diff(np.sign(np.diff(v[turns]))) != 0.0)
     assert np.all(np.abs(np.diff(v[turns])) > least)
+
+
+def test_a_rest_counts_from_a_tenth_of_a_second_after_its_step():
+    v = np.repeat([0.0, 5.0], 1000)
+    e = np.random.default_rng(0).standard_normal(v.size)
+    parts = [ResidualPart('r', Piece(v, v + e, RATE), e)]
+    series, rate, _ = series_of(parts, all_stretches(parts))
+    assert rate == RATE
+    # no step leads into the first rest
+    assert [(s.t, s.x.size) for s in series] == [(0.0, 1000), (1.1, 900)]
