@@ -85,6 +85,8 @@ def test_what_voltage_and_displacement_of_an_axis_both_tell_is_taken_out_once():
     both = part_of('sines', added, {'v_b': 5.0 * other, 'y_b': 1e-6 * other})
     tests = channel_tests([both])
     assert [test.significant for test in tests] == [True, True]
+    # a displacement is no cause
+    assert [test.tells for test in tests] == [True, False]
     (left,) = without_channels([both], tests)
     # taken out twice, as much as there was is left
     alone = part_of('sines', 0.0, {})
@@ -96,3 +98,4 @@ def test_too_little_data():
     (test,) = channel_tests([ResidualPart('r', piece, np.ones(100))])
     assert not test.significant
     assert test.added == ()
+    assert not test.tells

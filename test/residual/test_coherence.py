@@ -22,10 +22,11 @@ def part(v, e):
     return ResidualPart('r', Piece(v, v + e, RATE), e)
 
 
-def test_false_alarms_of_the_coherence():
-    v = noise()
+@pytest.mark.parametrize(('n', 'records'), [(N, 40), (256, 400)])
+def test_false_alarms_of_the_coherence(n, records):
+    v = noise()[:n]
     rng = np.random.default_rng(2)
-    bound = [coherence([part(v, rng.standard_normal(N))]) for _ in range(40)]
+    bound = [coherence([part(v, rng.standard_normal(n))]) for _ in range(records)]
     above = np.mean([np.mean((c.coherence > c.bound)[c.tested]) for c in bound])
     assert 0.003 < above < 0.02
     assert np.mean([c.share for c in bound]) < 0.02
