@@ -51,6 +51,16 @@ def test_dependence_on_voltage_direction_and_speed():
     assert np.polyfit(curve.x, curve.mean, 1)[0] == pytest.approx(1e-11, rel=0.05)
 
 
+@pytest.mark.parametrize(('periods', 'least', 'most'), [(2, 0, 2), (3, 20, 24)])
+def test_a_point_of_a_curve_has_three_visits(periods, least, most):
+    v = np.tile(np.append(np.arange(200.0), np.arange(200.0, 0.0, -1.0)), periods)
+    e = 1e-9 * np.random.default_rng(3).standard_normal(v.size)
+    up, down = curves(analyse([ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)]), 'v')
+    # each way takes 0.1 s: two stretches of time, which share a bin of the 24
+    assert least <= up.x.size <= most
+    assert least <= down.x.size <= most
+
+
 def test_creep_is_straight_over_the_logarithm_of_time():
     v = np.repeat([0.0, 5.0, 10.0, 2.0, 7.0, 3.0], 6000)
     step = np.repeat(np.diff(v[::6000], prepend=0.0), 6000)

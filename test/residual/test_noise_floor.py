@@ -137,6 +137,27 @@ def test_a_residual_that_is_white_throughout_is_noise():
     assert floor.at(4) == pytest.approx(1e-9, rel=0.05)
 
 
+def test_a_rest_tells_the_step_that_led_into_it():
+    v = np.append(0.0, np.full(999, 5.0))
+    (rest,) = stretches_of(ResidualPart('r', Piece(v, v, RATE), np.zeros(1000)))
+    assert (rest.kind, rest.start, rest.stop, rest.step) == ('rest', 1, 1000, 5.0)
+
+
+def test_a_repeat_behind_a_long_rest_is_found():
+    # the period is sought in a million samples
+    v = np.append(np.zeros(2**20), np.sin(2 * np.pi * np.arange(2**20) / 2**14))
+    ((start, stop, period),) = find_repeats(v)
+    assert (stop, period) == (2**21, 2**14)
+    assert abs(start - 2**20) <= 8
+
+
+def test_a_lost_sample_lies_on_a_line():
+    piece = Piece(np.arange(3.0), np.arange(3.0), RATE)
+    part = ResidualPart('r', piece, [0.0, 9.0, 2.0], [True, False, True])
+    assert_array_equal(part.e, [0.0, 1.0, 2.0])
+    assert_array_equal(part.y_hat, [0.0, 0.0, 0.0])
+
+
 def test_bridged_samples_are_cut_out():
     e = np.zeros(V.size)
     sound = np.ones(V.size, bool)
