@@ -5,7 +5,7 @@
 
 import numpy as np
 from piezo_ident.record.record import Piece
-from piezo_ident.residual.beyond_drive import channel_tests, without_channels
+from piezo_ident.residual.beyond_drive import channel_tests, without_channels, without_drive
 from piezo_ident.residual.lines import find_lines
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 import pytest
@@ -91,6 +91,17 @@ def test_what_voltage_and_displacement_of_an_axis_both_tell_is_taken_out_once():
     # taken out twice, as much as there was is left
     alone = part_of('sines', 0.0, {})
     assert np.std(left.e - alone.e) < 0.1 * STROKE * np.std(added)
+
+
+def test_functions_of_the_drive_and_their_lags_are_taken_out():
+    v = np.random.default_rng(5).standard_normal(2000)
+    lag = np.exp(-2 * np.pi * 10.0 / RATE)
+    slow = lfilter([1 - lag], [1, -lag], v - v[0]) + v[0]
+    use = np.ones(v.size, bool)
+    for e in (v, v**2, v**3, np.diff(v, prepend=v[0]), np.diff(v, 2, prepend=[v[0]] * 2), slow):
+        assert np.std(without_drive(e, v, RATE, use)) < 5e-3 * np.std(e)
+    other = np.random.default_rng(6).standard_normal(v.size)
+    assert np.std(without_drive(other, v, RATE, use)) > 0.9
 
 
 def test_too_little_data():

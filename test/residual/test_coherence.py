@@ -37,6 +37,8 @@ def test_the_coherent_share_is_all_but_the_noise_and_too_little_data_give_none()
     e = 0.2 * np.roll(v, 7) + 0.05 * np.random.default_rng(4).standard_normal(N)
     share = 0.04 * v.var() / (0.04 * v.var() + 0.0025)
     assert coherence([part(v, e)]).share == pytest.approx(share, abs=0.1)
+    for n in (N, 256):
+        assert coherence([part(v[:n], 3.0 * v[:n])]).share == pytest.approx(1.0, abs=1e-6)
     assert coherence([part(np.arange(40.0), np.zeros(40))]) is None
 
 

@@ -6,15 +6,17 @@
 from functools import cache
 
 import numpy as np
+from numpy.testing import assert_allclose
 from piezo_ident.record.record import Piece
 from piezo_ident.residual.line_spectrum import Series, series_of, Spectrum
-from piezo_ident.residual.lines import find_lines, without_lines
+from piezo_ident.residual.lines import _log_chance, find_lines, without_lines
 from piezo_ident.residual.stretches import all_stretches, ResidualPart
 import pytest
 from residual_data import misfit, part_of, pink, RATE, STROKE, T, V, Y_HAT
 from residual_stages import drives, foreign
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
+from scipy.stats import gamma
 
 DRIVES = drives()
 
@@ -157,6 +159,12 @@ def test_two_rests_far_apart_agree_on_one_frequency():
     e[moving] += 3e-8 * rng.standard_normal(n.size)
     line, *_ = search(ResidualPart('r', Piece(v, 7e-6 * v + e, RATE), e)).lines
     assert line.frequency == pytest.approx(hertz, abs=0.002)
+
+
+@pytest.mark.parametrize('records', [1, 3])
+def test_the_chance_of_a_score_is_that_of_exponential_variables(records):
+    total = np.array([0.5, 5.0, 50.0, 499.0, 501.0, 600.0])
+    assert_allclose(_log_chance(total, records), -gamma.logsf(total, records), rtol=1e-4)
 
 
 def transform(s: Series, hertz: np.ndarray) -> np.ndarray:
