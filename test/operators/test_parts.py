@@ -33,6 +33,7 @@ def test_parts_of_another_form_or_state_run_apart():
     v = np.array([0.5, 0.6, 0.3, 0.9])
     play = Hysteresis([0.2], [1.0], 0.0, 0.0)
     others = [replace(play, p2=0.5), replace(play, bias=[0.3]), replace(play, curves=[[0.4]])]
+    others.append(replace(play, p2=0.5, curves=[[0.4]]))
     hs = [play, *others, play, Hysteresis([0.2], [0.5], 0.0, 0.0, curves=[[0.1]])]
     parts = [(h, np.array([start])) for h in hs for start in (0.3, 0.5)]
     alone = [h(v, start) for h, start in parts]
@@ -48,3 +49,12 @@ def test_parts_of_the_same_plays_run_together():
     assert [len(group) for group in curved] == [SIDE_BY_SIDE] * 5
     for group in groups:
         assert all(np.array_equal(h.thresholds, group[0][0].thresholds) for h, _ in group)
+
+
+def test_lags_begin_where_the_stage_rested():
+    v = np.array([0.5, 0.6, 0.3, 0.9])
+    lags = [[2.0, 1.0, 0.0, 0.0], [2.0, 0.0, 1.0, 0.0], [4.0, 0.0, 0.0, 1.0]]
+    hs = [Hysteresis([], [], 0.0, 0.0, relaxations=[row]) for row in lags]
+    found = list(columns_of_parts(v, [(h, np.zeros(0)) for h in hs], rest=0.8))
+    assert_allclose(found, [h.follow(v, h.settled(0.8))[0] for h in hs], rtol=1e-12)
+    assert abs(found[0][0] - hs[0](v)[0]) > 0.01
