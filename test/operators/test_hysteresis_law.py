@@ -12,8 +12,9 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import paper_stage
 from piezo_ident.common.errors import ModelError
-from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.operators.hysteresis import Hysteresis, LINE
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
+from piezo_ident.operators.kernels import curve, curve_slope
 import pytest
 
 R = np.arange(1, 20) / 20
@@ -70,6 +71,53 @@ def test_densities_never_fall_and_the_slope_is_what_is_promised(seed, name):
     # a chord, against the least slope of the branch
     assert np.all(dw[du > 1e-6] / du[du > 1e-6] >= h.lowest_slope() - 1e-6)
     assert np.all(dw[du < -1e-6] / du[du < -1e-6] >= h.lowest_slope() - 1e-6)
+
+
+def test_lowest_slope_of_polynomial_lines_and_lags():
+    h = Hysteresis([0.5], [2.0], -0.1, 1.0, p0=-0.2)
+    # the derivative of -0.1 v^3 - 0.2 v^2 + v; the play stands after a turn
+    assert_allclose(h.slope_at_turns(np.array([0.0, 0.5, 1.0])), [1.0, 0.725, 0.3])
+    assert h.flattest == pytest.approx((0.3, 1.0))
+    # z stands after a turn, and phi = 0.1 v + 0.2 v^2 + 0.1 v^3 leaves
+    lagging = replace(h, relaxations=[[3.0, 0.1, 0.2, 0.1]])
+    assert_allclose(lagging.slope_at_turns(np.array([0.0, 0.5])), [0.9, 0.725 - 0.375])
+    # a line moves at once, with 2 (1 - 0.5) of its play
+    assert_allclose(h.with_lines(1).slope_at_turns(np.array([0.0, 1.0])), [2.0, 1.3])
+
+
+@pytest.mark.parametrize('count', [0, 1, 2, 3])
+def test_lines_have_the_strokes_of_their_plays(count):
+    curves, bias = [[0.3], [0.2], [0.1]], [0.1, 0.2, 0.3]
+    h = Hysteresis([0.1, 0.2, 0.4], [0.3, 0.2, 0.5], 0.0, 1.0, curves=curves, bias=bias)
+    lines = h.with_lines(count)
+    assert np.all(lines.thresholds[:count] < LINE)
+    assert_array_equal(lines.thresholds[count:], h.thresholds[count:])
+    for one in (h, replace(h, curves=None), replace(h, bias=None), replace(h, span=(-0.5, 1.5))):
+        sweep = np.linspace(*one.span, 50)
+        at_low = np.full(3, one.span[0])
+        strokes = [np.ptp(x(sweep, at_low)) for x in (one, one.with_lines(count))]
+        assert strokes[1] == pytest.approx(strokes[0], rel=1e-9)
+
+
+def test_the_slope_of_a_curve_is_that_of_its_values():
+    c = np.array([[0.3], [-0.2], [0.1], [0.0], [0.8]])
+    for t in (0.1, 0.5, 0.7):
+        rise = (curve(c, 0, t + 1e-5) - curve(c, 0, t - 1e-5)) / 2e-5
+        assert curve_slope(c, 0, t) == pytest.approx(rise, rel=1e-8)
+    assert curve_slope(c, 0, -0.1) == curve_slope(c, 0, 0.9) == 0.0
+
+
+def test_roughness_is_of_sizes_over_gaps_and_of_neighbours():
+    law = HysteresisLaw('preisach', [0.1, 0.3])
+    even = np.ones(law.size)
+    rows = law.roughness(0.5, 4.0) @ even
+    # q over density and gap, the other densities over their change, and no differences
+    assert_allclose(rows[:2], [1 / 0.5 / 0.1, 1 / 0.5 / 0.2])
+    assert_allclose(rows[2 : law.densities], 1 / 4.0)
+    assert_array_equal(rows[law.densities :], 0.0)
+    # a polynomial of degree three has three neighbours, each of five hats its own
+    slope = law.roughness(0.5, 4.0) @ np.arange(law.size)
+    assert_allclose(slope[law.densities :], np.full(15, 1 / 4.0))
 
 
 @pytest.mark.parametrize('name', LAWS[1:])
@@ -142,6 +190,16 @@ def test_idle_plays_are_left_out_without_a_change():
         slim = h.without_idle()
         assert slim.thresholds.size < h.thresholds.size
         assert_allclose(slim(path()), h(path()), atol=1e-14)
+    # a curve moves without a weight, too
+    bent = Hysteresis([0.2, 0.4], [0.0, 0.0], 0.0, 1.0, curves=[[0.0], [0.3]])
+    assert_array_equal(bent.without_idle().thresholds, [0.4])
+
+
+def test_a_density_below_zero_by_rounding_is_no_fault():
+    rounded = Hysteresis([0.5], [0.0], 0.0, 1.0, curves=[[-1e-11]])
+    assert rounded.rise([0.5])[0] < 0.0
+    with pytest.raises(ModelError, match='negative'):
+        replace(rounded, curves=[[-1e-8]])
 
 
 def test_lags_along_the_path_know_no_time_and_no_sampling():
