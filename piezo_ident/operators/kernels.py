@@ -175,8 +175,9 @@ def dynamics(w: Array, b: Array, a: Array, y: Array) -> None:
     """
     nb, na = b.size, a.size
     for start in range(0, y.size - na, STRETCH):
-        n = min(STRETCH, y.size - na - start)
-        inputs, outputs = w[start : start + nb - 1 + n], y[start : start + na + n]
+        # slices end with their arrays
+        inputs = w[start : start + nb - 1 + STRETCH]
+        outputs = y[start : start + na + STRETCH]
         _forward(inputs, b, outputs[na:])
         _backward(a, outputs)
         if _dies_away(outputs[na:]):

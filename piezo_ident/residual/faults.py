@@ -241,10 +241,8 @@ def _jitter(part: ResidualPart, noise: _Noise, known: Mask) -> tuple[float, floa
 
 def _slope(x: Array, other: Array, y: Array) -> tuple[float, float]:
     """Fit the slope of y over x beside another variable; also return its robust deviation."""
-    scale = max(float(other.max(initial=0.0)), 1e-300)
+    scale = max(float(other.max()), 1e-300)
     A = np.column_stack([x / float(x.max()), np.ones(x.size), other / scale])
-    if other.max(initial=0.0) <= 0.0:
-        A = A[:, :2]
     y_scale = max(float(np.mean(y)), 1e-300)
     target, weight = y / y_scale, np.ones(x.size)
     coefficients, errors = np.zeros(A.shape[1]), np.full(A.shape[1], np.inf)
