@@ -90,15 +90,23 @@ def test_a_wrong_mode_is_no_jitter(truth):
     assert faults(v, y + ringing + 1.5e-9 * rng.standard_normal(y.size), y)[0] == {}
 
 
-@pytest.mark.parametrize('jitter', [1e-6, 5e-6])
-def test_timing_jitter(truth, jitter):
+@pytest.mark.parametrize(('jitter', 'step'), [(1e-7, 0.0), (1e-6, 0.0), (1e-6, 9e-9), (5e-6, 0.0)])
+def test_timing_jitter(truth, jitter, step):
     v, y, read = truth
     rng = np.random.default_rng(4)
-    z = read + np.gradient(y) * RATE * jitter * rng.standard_normal(y.size)
+    speed = np.gradient(y) * RATE
+    z = read + speed * jitter * rng.standard_normal(y.size)
+    z = step * np.rint(z / step) if step else z
     named, _ = faults(v, z, y)
-    assert set(named) == {'timing_jitter'}
-    said = re.search(r'scatter by (\S+) us rms', named['timing_jitter'].action)
+    assert set(named) == {'timing_jitter', *(['quantisation'] if step else [])}
+    said = re.search(r'by (\S+) us rms.* grows (\S+) times', named['timing_jitter'].action)
     assert float(said[1]) == pytest.approx(1e6 * jitter, rel=0.1)
+    # without jitter: 1.5 nm of noise, and the step of the readings
+    noise2 = 1.5e-9**2 + max(step, 2.289e-9) ** 2 / 12.0
+    if jitter < 2e-6:
+        speed2 = np.mean(speed[: y.size // 64 * 64].reshape(-1, 64) ** 2, axis=1)
+        grown = 1.0 + jitter**2 * np.quantile(speed2, 0.98) / noise2
+        assert float(said[2]) == pytest.approx(grown, rel=0.2)
 
 
 @pytest.mark.parametrize('bits', [8, 10, 12])
