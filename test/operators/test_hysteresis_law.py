@@ -85,6 +85,19 @@ def test_lowest_slope_of_polynomial_lines_and_lags():
     assert_allclose(h.with_lines(1).slope_at_turns(np.array([0.0, 1.0])), [2.0, 1.3])
 
 
+def test_a_lag_is_flattest_behind_a_long_sweep():
+    h = Hysteresis([], [], 0.0, 1.0, relaxations=[[8.0, 0.9, 0.0, 0.0]])
+    # after a turn z stands 0.9 / 8 behind phi: w follows 1 - 0.9, less the 8 times 0.9 / 8 of z
+    assert h.lowest_slope() == pytest.approx(1.0 - 0.9 - 0.9, abs=0.05)
+    assert_allclose(h.slopes(sweeps=False)[1], 1.0 - 0.9)
+
+
+@pytest.mark.parametrize('name', ['plays', 'square', 'preisach', 'duhem'])
+def test_slopes_of_a_law_add_up_to_those_of_h(name):
+    law, theta, h = law_and_h(name)
+    assert_allclose(law.slopes @ theta, h.slopes(sweeps=True)[1], atol=1e-9)
+
+
 @pytest.mark.parametrize('count', [0, 1, 2, 3])
 def test_lines_have_the_strokes_of_their_plays(count):
     curves, bias = [[0.3], [0.2], [0.1]], [0.1, 0.2, 0.3]
