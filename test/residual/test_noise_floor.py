@@ -53,6 +53,10 @@ def test_repeats_of_two_periods_meet_and_do_not_overlap():
     assert [(start, stop) for start, stop, _ in found] == [(0, 441), (441, 1000)]
     for start, stop, period in found:
         assert_array_equal(v[start + period : stop], v[start : stop - period])
+    # a wave of 0.2 % makes three teeth the period, which also fits the teeth without the wave
+    v = np.tile(tooth, 40)
+    v[400:] += 0.038 * np.cos(2 * np.pi * np.arange(1200) / 120)
+    assert find_repeats(v) == [(0, 440, 40), (440, 1600, 120)]
 
 
 def test_nothing_repeats_where_nothing_comes_back():
