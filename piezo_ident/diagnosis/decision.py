@@ -31,6 +31,7 @@ import itertools
 import math
 
 import numpy as np
+from piezo_ident.common.choice import simplest
 from piezo_ident.diagnosis.criteria import (
     ALIKE,
     BEYOND_CHANCE,
@@ -238,7 +239,7 @@ def decide(candidates: Candidates) -> Decision:
     bests = [c for c in candidates.bests if candidates.is_admissible(c.effects)]
     if not bests:
         return _set_in(candidates)
-    best = _simplest(candidates, bests)
+    best = simplest(bests, candidates.left, lambda c: c.size, ALIKE)
     rivals = _rivals_of(candidates, best)
     common = set(best.effects).intersection(*rivals)
     names = dict.fromkeys(itertools.chain(best.effects, *rivals))
@@ -252,18 +253,11 @@ def _set_in(candidates: Candidates) -> Decision:
     # only labels tell the earlier error on other motion
     if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
         return Decision(None, candidates.left(candidates.without()))
-    best = _simplest(candidates, found)
+    best = simplest(found, candidates.left, lambda c: c.size, ALIKE)
     most = RIVALS * candidates.left(best)
     rivals = [c for c in found if c is not best and candidates.left(c) <= most]
     names = tuple(c.effects[0] for c in (best, *rivals)) if rivals else ()
     return Decision(best, candidates.given, names, set_in=True)
-
-
-def _simplest(candidates: Candidates, some: Sequence[FittedSet]) -> FittedSet:
-    """Return the candidate with the fewest parameters among those about as good as the best."""
-    least = min(map(candidates.left, some))
-    alike = [c for c in some if candidates.left(c) <= ALIKE * least]
-    return min(alike, key=lambda c: (c.size, candidates.left(c)))
 
 
 def _rivals_of(candidates: Candidates, best: FittedSet) -> tuple[tuple[str, ...], ...]:

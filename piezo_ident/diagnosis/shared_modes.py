@@ -29,6 +29,7 @@ import warnings
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.choice import simplest
 from piezo_ident.common.errors import DataError, IdentificationError, ModelError
 from piezo_ident.diagnosis.creep_of_modes import with_creep
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT, TAKES
@@ -173,8 +174,7 @@ def _found(
         return None
     fitted = search.laws()
     errors |= {law: search.error(dict.fromkeys(search.groups, x)) for law, x in fitted.items()}
-    limit = min(errors[law] for law in LAWS) / (1 - LAW_GAIN)
-    law = next(law for law in LAWS if errors[law] <= limit)
+    law = simplest(LAWS, errors.__getitem__, LAWS.index, 1 / (1 - LAW_GAIN))
     if law in IN_FRONT or not _beats(errors[law], errors['chains']):
         return None
     last = [record for part in to_fit for record in part] if tests else every

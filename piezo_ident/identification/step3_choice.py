@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.choice import simplest
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.solvers.least_squares import triangular_factor
@@ -239,10 +240,7 @@ def choose_law(
         ]
     if not better:
         return Choice(None, errors)
-    best = min(better, key=errors.__getitem__)
-    chosen = next(
-        name for name in better if np.mean(logs[best] - logs[name]) >= np.log(1.0 - LAW_GAIN)
-    )
+    chosen = simplest(better, errors.__getitem__, LAWS.index, 1.0 / (1.0 - LAW_GAIN))
     return Choice(law_of[chosen], errors)
 
 

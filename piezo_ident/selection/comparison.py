@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from piezo_ident.common.arrays import Integers
+from piezo_ident.common.choice import simplest
 from piezo_ident.fitting.free_run import Fit
 
 #: mean squares within this factor count as alike; it is 5 % of an rms (taste)
@@ -80,11 +81,10 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     The lower price decides between equal numbers of parameters.  The first candidate wins
     if no error is resolved, because rounding decides which of the weights are zero.
     """
-    least = min(c.price for c in candidates)
-    alike = [c for c in candidates if c.price <= ALIKE * least]
-    if least <= RESOLVED:
-        return min(alike, key=lambda c: c.price)
-    return min(alike, key=lambda c: (c.fit.stage.size, c.price))
+    best = min(candidates, key=lambda c: c.price)
+    if best.price <= RESOLVED:
+        return best
+    return simplest(candidates, lambda c: c.price, lambda c: c.fit.stage.size, ALIKE)
 
 
 def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:

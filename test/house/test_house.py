@@ -50,7 +50,7 @@ ROOMS = (
 # Lines and modules of rooms, at most: what was reached, to the next hundred.
 SIZES = {
     'cli': (2100, 12),
-    'common': (1000, 8),
+    'common': (1000, 9),
     'control': (2200, 10),
     'diagnosis': (6000, 24),
     'effects': (3100, 23),
@@ -71,7 +71,7 @@ SIZES = {
     'record/tables': (1400, 7),
     'report': (2100, 10),
     'report/figures': (1500, 8),
-    'residual': (2000, 11),
+    'residual': (2000, 10),
     'selection': (300, 4),
     'uncertainty': (900, 12),
 }

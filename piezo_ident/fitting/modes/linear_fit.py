@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
+from piezo_ident.common.choice import simplest
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.damped import descend, Schedule
 from piezo_ident.fitting.modes.frequency_response import frequency_response, LineResponse
@@ -93,8 +94,7 @@ def choose_order(
         errors[order] = percent_of(held_out, [modes.steady(r.u[-1]) for r in held_out])
     if not found:
         raise IdentificationError(f'{len(response.lines)} lines determine none of {orders}')
-    best = min(errors.values())
-    order = min(o for o, e in errors.items() if e <= best * (1 + ORDER_GAIN))
+    order = simplest(errors, errors.__getitem__, size=int, factor=1 + ORDER_GAIN)
     return refined(found[order], response, iterations=20), errors
 
 
