@@ -12,10 +12,7 @@ T = TypeVar('T')
 
 
 def simplest(
-    candidates: Collection[T],
-    error: Callable[[T], float],
-    size: Callable[[T], float],
-    factor: float,
+    candidates: Collection[T], error: Callable[[T], float], size: Callable[[T], int], factor: float
 ) -> T:
     """
     Choose the smallest of the candidates with an error of at most `factor` times the least error.

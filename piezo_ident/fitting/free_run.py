@@ -69,14 +69,10 @@ class Fit:
 
     def prior_weight(self) -> Array:
         """Compute the information that the prior adds to the equations, shape (p, p)."""
-        return _prior_weight(self.stage, self.loss, _observations(self.rows))
+        return self.stage.prior[1] * (self.loss / _observations(self.rows))
 
     def held_out(self, sets: Integers) -> Array:
-        """
-        Predict every block from the other sets, and sum its squared errors; shape (n_b,).
-
-        `NormalEquations.solved_without` describes the sets.
-        """
+        """Predict every block from the other sets, and sum its squared errors; shape (n_b,)."""
         stage, equations = self.stage, self.equations
         lower, upper = (bound - stage.values for bound in stage.bounds)
         solve = partial(bounded_step, lower=lower, upper=upper, rising=stage.rising)
@@ -199,7 +195,7 @@ def _solved(
     bounds, away = (lower - values, upper - values), stage.prior[0] - values
     A, b, step = equations.A.sum(axis=0), equations.b.sum(axis=0), np.zeros(values.size)
     for _ in range(PASSES):
-        W, before = _prior_weight(stage, left, count), left
+        W, before = stage.prior[1] * (left / count), left
         step = bounded_step(A + W, b + W @ away, *bounds, damping=damping, rising=stage.rising)
         left = max(here.loss - float(step @ (2.0 * b - A @ step)), EXACT * here.loss)
         if left > ALIKE * before:
@@ -216,7 +212,3 @@ def _cost(loss: float, count: float, stage: Stage, values: Array) -> float:
 
 def _observations(rows: Integers) -> float:
     return max(1.0, OBSERVATIONS * float(np.count_nonzero(rows)))
-
-
-def _prior_weight(stage: Stage, loss: float, count: float) -> Array:
-    return stage.prior[1] * (loss / count)
