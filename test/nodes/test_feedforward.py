@@ -304,6 +304,7 @@ def test_a_gain_that_changed_is_made_up_for_on_request(lab):
     scaling = replace(model.scaling, Y=model.scaling.Y / 1.03)
     text = model_to_yaml(replace(model, scaling=scaling))
     errors = lab.collect('tracking_error')
+    assert lab.set('feedforward', 'silence', PATIENT)[0]
     given(lab, text)
     for follow, least, most in (('off', 2.0, 3.0), ('gain', 0.0, 0.1)):
         before = lab.status('feedforward')['models']
@@ -328,6 +329,7 @@ def test_a_gain_that_changed_is_made_up_for_on_request(lab):
     lab.wait(gains, 'the gain')
     assert gains()[-1] == pytest.approx(0.03, abs=2e-3)
     assert lab.set('feedforward', 'follow', 'off') == (True, '')
+    assert lab.set('feedforward', 'silence', SILENCE)[0]
 
 
 @pytest.mark.timed

@@ -249,12 +249,13 @@ def test_modes_that_run_away_end_the_drive_at_rest(lab, identified):
 
 def test_a_stop_ramps_both_axes(lab):
     applied = [lab.collect(topic) for topic in ('applied_voltage', 'applied_voltage_b')]
-    assert lab.set('excitation', 'program', BOTH.replace('periods: 2', 'periods: 80'))[0]
+    assert lab.set('excitation', 'program', BOTH.replace('periods: 2', 'periods: 800'))[0]
     seen = len(lab.statuses('excitation'))
     assert lab.call('excitation/start')[0]
     lab.until('excitation', 'running', since=seen)
     lab.wait(lambda: len(applied[1]) > 10, 'voltages')
-    assert lab.call('excitation/stop')[0]
+    ok, said = lab.call('excitation/stop')
+    assert ok, said
     lab.until('excitation', 'stopped', since=seen)
     for blocks in applied:
         assert max(block.values.max() for block in blocks) > 1.0
