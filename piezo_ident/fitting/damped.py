@@ -23,7 +23,7 @@ L = TypeVar('L')
 
 
 @dataclass(frozen=True)
-class Schedule:
+class DampingSchedule:
     """
     Damping of the steps, as a share of the energy of each column, and the end of a descent.
 
@@ -51,7 +51,7 @@ def descend(
     cost: Callable[[T], float],
     linearise: Callable[[T], L],
     step: Callable[[T, L, float], T | None],
-    schedule: Schedule,
+    schedule: DampingSchedule,
     iterations: int,
     tick: Callable[[], None] = lambda: None,
 ) -> T:

@@ -19,13 +19,13 @@ import math
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.fitting.damped import descend, Schedule
+from piezo_ident.fitting.damped import DampingSchedule, descend
 from piezo_ident.fitting.equations import bounded_step, NormalEquations
 from piezo_ident.fitting.stage import Stage
 from piezo_ident.fitting.stretch import Stretch
 
 #: damping of the steps
-SCHEDULE = Schedule(first=1e-4, least=1e-9, worse=5.0, better=10.0, most=1e6)
+SCHEDULE = DampingSchedule(first=1e-4, least=1e-9, worse=5.0, better=10.0, most=1e6)
 #: the fit ends if a step lowers the loss, or promises to, by less than this share
 SLOW = 1e-4
 #: independent observations in a block, as neighbouring residuals are alike (taste)

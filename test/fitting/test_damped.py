@@ -7,10 +7,10 @@ from dataclasses import replace
 import math
 
 from piezo_ident.common.errors import ModelError
-from piezo_ident.fitting.damped import descend, Schedule
+from piezo_ident.fitting.damped import DampingSchedule, descend
 import pytest
 
-SCHEDULE = Schedule(first=1e-2, least=1e-3, worse=4.0, better=10.0, slow=1e-6)
+SCHEDULE = DampingSchedule(first=1e-2, least=1e-3, worse=4.0, better=10.0, slow=1e-6)
 
 
 def descended(start, schedule=SCHEDULE, step=None, iterations=50):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.choice import simplest
 from piezo_ident.common.errors import IdentificationError
-from piezo_ident.fitting.damped import descend, Schedule
+from piezo_ident.fitting.damped import DampingSchedule, descend
 from piezo_ident.fitting.modes.frequency_response import frequency_response, LineResponse
 from piezo_ident.fitting.modes.periods import percent_of, PeriodicRecord
 from piezo_ident.fitting.modes.subspace import subspace
@@ -32,7 +32,7 @@ THIN = 3
 #: steps of each order that is tried
 STEPS = 6
 #: damping of the steps, and the end of a fit (taste)
-SCHEDULE = Schedule(1e-3, 1e-9, worse=6.0, better=6.0, tries=8, slow=3e-3, slow_steps=3)
+SCHEDULE = DampingSchedule(1e-3, 1e-9, worse=6.0, better=6.0, tries=8, slow=3e-3, slow_steps=3)
 
 
 def refined(model: Modal, response: LineResponse, *, iterations: int = 20) -> Modal:

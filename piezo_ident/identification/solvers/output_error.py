@@ -21,7 +21,7 @@ import numpy as np
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
-from piezo_ident.fitting.damped import descend, Schedule
+from piezo_ident.fitting.damped import DampingSchedule, descend
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
@@ -30,7 +30,7 @@ RADIUS = 0.99999
 #: number of samples whose products are summed at once
 STRETCH = 1024
 #: damping of the steps, and the end of the refinement
-SCHEDULE = Schedule(1e-3, 1e-12, worse=4.0, better=10.0, most=1e8, slow=1e-7)
+SCHEDULE = DampingSchedule(1e-3, 1e-12, worse=4.0, better=10.0, most=1e8, slow=1e-7)
 
 
 @dataclass(frozen=True, eq=False)
