@@ -124,17 +124,17 @@ def test_slower_and_faster_than_real_time(lab, factor):
     assert lab.set('excitation', 'block_size', 1000)[0]
     count = len(list(cut_blocks(sequence.n, sequence.segments, 1000)))
     back, altered = lab.collect('displacement'), counts(lab, 'altered')
-    seen, arrivals = len(back), lab.arrivals('voltage')
-    sent = len(arrivals)
+    seen = len(back)
     try:
         assert lab.set('excitation', 'rate_factor', factor) == (True, '')
+        begin = time.monotonic()
         assert lab.finish('excitation/start')['state'] == 'done'
+        # the last block has its time, whenever the test hears of the blocks
+        assert time.monotonic() - begin > 0.99 * (sequence.duration - 1000 / FS) / factor
         lab.wait(lambda: len(back) >= seen + count, 'all of displacement')
         # every run starts the sample clock
         t, _ = column(back[seen:])
         assert t.tobytes() == (np.arange(sequence.n) / FS).tobytes()
-        # a late first block is no higher rate
-        assert arrivals[-1] - arrivals[sent] > 0.5 * sequence.duration / factor
     finally:
         assert lab.set('excitation', 'rate_factor', 1.0)[0]
         assert lab.set('excitation', 'block_size', 100)[0]
