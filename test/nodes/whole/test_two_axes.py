@@ -32,6 +32,8 @@ segments:
 """
 TOPICS = ['voltage_b', 'displacement_b']
 AXES = {'axes': ['b']}
+#: a pause that a busy machine does not reach [s]
+PATIENT = {'silence': 2.0}
 #: as little work as shows two axes
 QUICK = {'thresholds': 4, 'max_order': 2, 'nice': 0}
 
@@ -181,7 +183,8 @@ def test_both_axes_follow_their_references(lab, identified, shares_modes):
     if shares_modes:
         model, path = lagging(pi.load(path)), identified[1] / 'lagging.yaml'
         model.save(path)
-    lab.start('feedforward', {**AXES, 'sample_rate': RATE, 'model': str(path), 'slew': 1000.0})
+    params = {**AXES, **PATIENT, 'sample_rate': RATE, 'model': str(path), 'slew': 1000.0}
+    lab.start('feedforward', params)
     sent = [lab.collect(topic) for topic in ('voltage', 'voltage_b')]
     errors, begin = lab.collect('tracking_error_b'), [len(blocks) for blocks in sent]
     # until then the stage follows the excitation
@@ -228,7 +231,7 @@ def test_modes_that_run_away_end_the_drive_at_rest(lab, identified):
     limits = {'voltage_high': 11.0, 'slew': 1000.0, 'ramp_slew': 200.0}
     # the model of the identifier would replace that of the file
     own = {'model': 'no_model'}
-    params = {**AXES, 'sample_rate': RATE, 'model': str(path), **limits}
+    params = {**AXES, **PATIENT, 'sample_rate': RATE, 'model': str(path), **limits}
     lab.start('feedforward', params, remaps=own)
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
     seen = len(lab.statuses('feedforward'))
