@@ -22,7 +22,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.fitting.damped import DampingSchedule, descend
 from piezo_ident.fitting.equations import bounded_step, NormalEquations
 from piezo_ident.fitting.stage import Stage
-from piezo_ident.fitting.stretch import Stretch
+from piezo_ident.fitting.stretch import block_count, Stretch
 
 #: damping of the steps
 SCHEDULE = DampingSchedule(first=1e-4, least=1e-9, worse=5.0, better=10.0, most=1e6)
@@ -126,8 +126,8 @@ def fit(
             'the first guess of the free-run fit diverges on these data; are all values of a '
             'plausible size?'
         )
-    blocks = 1 + max(int(s.block[-1]) for s in stretches)
-    rows = np.sum([np.bincount(s.block[s.use], minlength=blocks) for s in stretches], axis=0)
+    n = block_count(stretches)
+    rows = np.sum([np.bincount(s.block[s.use], minlength=n) for s in stretches], axis=0)
     count = _observations(rows)
     schedule = replace(SCHEDULE, enough=SLOW * count)
 
@@ -160,7 +160,7 @@ class _Point:
     @cached_property
     def equations(self) -> NormalEquations:
         """Normal equations of all stretches, block by block."""
-        stage, count = self.stage, 1 + max(int(s.block[-1]) for s in self._stretches)
+        stage, count = self.stage, block_count(self._stretches)
         p = stage.values.size
         A, b, total = np.zeros((count, p, p)), np.zeros((count, p)), np.zeros(count)
         for s, own, error in zip(self._stretches, self._signals, self._errors, strict=True):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,6 +58,11 @@ class Stretch:
     def with_use(self, use: Mask) -> Stretch:
         """Replace the mask of samples that count."""
         return replace(self, use=use)
+
+
+def block_count(stretches: Sequence[Stretch]) -> int:
+    """Count the blocks of all stretches together."""
+    return 1 + max(int(s.block[-1]) for s in stretches)
 
 
 def delayed(x: Array, samples: int) -> Array:

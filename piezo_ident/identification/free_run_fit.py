@@ -19,7 +19,7 @@ from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.common.errors import ConfigError, IdentificationError
 from piezo_ident.fitting.free_run import fit
 from piezo_ident.fitting.stage import PARTS
-from piezo_ident.fitting.stretch import remembered, Stretch
+from piezo_ident.fitting.stretch import block_count, remembered, Stretch
 from piezo_ident.identification.free_run_result import FreeRunFits, outcome_of
 from piezo_ident.identification.free_run_starts import Allowed, Search, UNKNOWN
 from piezo_ident.identification.prepare import MOVES, REST, Run
@@ -136,7 +136,7 @@ def _search(
     if sum(s.u.size for s in stretches) > MOST:
         stretches = _windows(stretches)
     law = HysteresisLaw('plays', even_thresholds(swing, settings.thresholds or PLAYS), SPAN)
-    count = 1 + max(int(s.block[-1]) for s in stretches)
+    count = block_count(stretches)
     steps = 0
 
     def tick() -> None:
