@@ -550,7 +550,7 @@ def test_what_cannot_be_diagnosed_is_refused(reason):
     settings = replace(ONLY_CREEP, most_samples=1000) if 'most' in reason else ONLY_CREEP
     with pytest.raises(IdentificationError, match=reason):
         diagnose(model, Record((REFUSALS[reason](record.pieces[0]),), 'changed'), settings)
-    with pytest.raises(IdentificationError, match=r'^diagnose: '):
+    with pytest.raises(IdentificationError, match=r'^diagnose: no record was given'):
         diagnose(model, [])
 
 

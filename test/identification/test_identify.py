@@ -566,7 +566,7 @@ def test_a_band_is_too_narrow_for_a_g_and_not_for_none(paper):
 
 
 def test_no_record_and_settings_of_another_type_are_refused():
-    with pytest.raises(IdentificationError, match=r'^identify: '):
+    with pytest.raises(IdentificationError, match=r'^identify: no record was given'):
         identify([])
     with pytest.raises(DataError, match=r'settings: .*dict; .*Settings\('):
         identify(short(), {'thresholds': 4})
