@@ -108,7 +108,10 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     assert lab.status('stage')['level'] == '1'
     assert 'no voltage for' in lab.status('stage')['text']
     lab.restart(killed)
-    assert 'the excitation ended early (idle)' in ended(lab, seen, 'failed')
+    # on a busy machine the start takes longer than the identifier waits for a stage in trouble
+    reason = ended(lab, seen, 'failed')
+    early, late = 'the excitation ended early (idle)', 'no displacement from the stage for 3 s'
+    assert early in reason or (late in reason and 'it says: no voltage' in reason), reason
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'rest')
     since = len(applied)
     seen = run(lab, PROGRAM)
