@@ -149,12 +149,15 @@ class ExcitationClient:
     def _leave(self, answer: Any = None) -> None:
         """Stop the program of a start that was given up, unless the start was refused."""
         # the answer to a newer start tells which of the two programs plays
-        if self._phase == 'starting' or (answer is not None and answer is not self.left):
+        if self._phase == 'starting':
             return
-        self.left = None
-        if answer is None or answer.result().success:
+        is_last = answer is None or answer is self.left
+        # the excitation refuses a newer start, given up as well, if it has accepted an earlier one
+        if (is_last or self.left is not None) and (answer is None or answer.result().success):
             self._stop.call_async(Trigger.Request())
-        self._give_back()
+        if is_last:
+            self.left = None
+            self._give_back()
 
     def _give_back(self, *_: object) -> None:
         """Restore the earlier program of the excitation, unless another run is being started."""
@@ -241,8 +244,7 @@ class ExcitationClient:
     def _asking(self) -> None:
         # without this service the excitation keeps the program of the run
         if self._get.service_is_ready() or time.monotonic() - self._sign < _AGAIN:
-            response = self._insisted('telling its program')
-            if response is None:
+            if (response := self._insisted('telling its program')) is None:
                 return
             if self._before is None and response.values:
                 self._before = response.values[0]
@@ -292,8 +294,7 @@ class ExcitationClient:
     def _response(self, doing: str) -> Any:
         if self._future.done():
             future, self._future = self._future, None
-            response = future.result()
-            if response is not None:
+            if (response := future.result()) is not None:
                 return response
             self._end(f'the excitation did not respond while {doing}')
         elif self._silent():

@@ -221,6 +221,25 @@ def test_a_late_answer_to_an_earlier_start_stops_no_newer_run(is_new_accepted, a
         assert programs(setter) == ['a program', 'another program', 'mine']
 
 
+def test_two_starts_that_were_cancelled_before_their_answers():
+    client, node = starting()
+    _, _, starter, stopper = node.clients
+    client.stop()
+    (earlier,) = starter.waited_for
+    starter.dropped = 2
+    client.start('another program', 20.0, lambda reason: None)
+    for _ in range(4):
+        client.poll()
+    assert client.is_starting
+    client.stop()
+    (newer,) = starter.waited_for - {earlier}
+    # the excitation plays the first program, and so refuses the second
+    earlier.set_result(Trigger.Response(success=True))
+    newer.set_result(Trigger.Response(success=False, message='a program plays'))
+    assert stopper.calls == 1
+    assert client.left is None and not client.running
+
+
 def test_a_program_that_is_over_is_not_stopped():
     client, node = starting()
     _, _, starter, stopper = node.clients
