@@ -10,6 +10,9 @@ import re
 
 import any_record
 import numpy as np
+import piezo_ident as pi
+from piezo_ident.cli.main import main
+from piezo_ident.diagnosis import criteria
 import pytest
 import study_diagnosis as study
 import study_tracking
@@ -117,3 +120,55 @@ def test_the_page_of_tracking_has_the_medians_of_its_cases():
             [stage, own[0]['found'], own[0]['error of the model'], *(f'{x:.2g}' for x in medians)]
         )
         assert f'| {line} |' in page
+
+
+def draw_of(name):
+    """Return the row of a draw of diagnoses."""
+    hiding, empty, growth = [], [], []
+    for row in cases_of(name):
+        words, end = set(row['case'].split()), row['outcome'].split(':')[0]
+        growth.append(float(row['unseen after']) / float(row['unseen before']))
+        if end != 'small' and not words & set(study.NO_CANDIDATES):
+            (empty if words & {'none', 'nothing'} else hiding).append(end)
+    found = f'{hiding.count("named") + hiding.count("class")} of {len(hiding)}'
+    false = f'{hiding.count("false")} | {empty.count("false")} of {len(empty)}'
+    return f'[{len(growth)} stages]({name}.csv) | {found} | {false} | {max(growth):.2f} |'
+
+
+def test_pages_quote_what_is_made_elsewhere():
+    noise = re.search(r'Sensor noise at rest, ([\d.]+) %', page_of('benchmarks'))
+    score = re.search(r'Brier score (0[.]\d+), of the base rate (0[.]\d+)', page_of('coverage'))
+    white, pink = (
+        [int(r['held %']) for r in cases_of('coverage') if r['stage and record'] == kind]
+        for kind in ('on white unlabelled', 'on 1/f unlabelled')
+    )
+    programs = [pi.Program.load(x) for x in ('identification', 'diagnosis', 'survey')]
+    steep = [f'{20e3 * np.abs(np.diff(x.build(20e3).v)).max():.0f} V/s' for x in programs]
+    quotes = f"""
+../README: from {programs[0].build(20e3).duration:.1f} s of its data
+../README: noise at rest is {noise[1]} %
+bands: in {min(white)} to {max(white)} % of the draws of white noise
+bands: in {min(pink)} to {max(pink)} % of 1/f noise
+diagnosis: {draw_of('diagnosis_study_foreign_2')}
+diagnosis: {draw_of('diagnosis_study_2')}
+diagnosis: is {criteria.BEYOND_CHANCE} times the largest on circularly shifted residuals
+diagnosis: within {criteria.ALIKE} times of it
+diagnosis: less than {criteria.RIVALS} times as much
+diagnosis: {pi.DiagnosisSettings().most_samples:,} samples
+driver: `identification` need {steep[0]}, of `diagnosis` {steep[1]}, of `survey` {steep[2]};
+driver: At {2e-3 * programs[0].entries[3].options['cutoff']:g} kHz or less
+limits: Brier score is {score[1]}, that of the base rate {score[2]} (
+method: ranks {pi.Settings().max_order ** 2} orders
+"""
+    for page, quote in (line.split(': ', 1) for line in quotes.strip().splitlines()):
+        assert quote in page_of(page), page
+
+
+def test_pages_show_what_commands_print(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = ''.join(f'{k / 1e3},{k},{1.25 * k}\n' for k in range(11))
+    Path('scan.csv').write_text(f'time_s,voltage,position_um\n{rows}')
+    Path('log.csv').write_text('Drive (V),Sensor (um)\n0,0\n1,1\n')
+    for name in ('scan', 'log'):
+        main(['convert', f'{name}.csv', f'{name}.npz'])
+        assert flat(capsys.readouterr().err) in page_of('files')
