@@ -5,9 +5,9 @@
 Step 3: choose the law of H and its thresholds by data that were not fitted.
 
 Each of eight parts of the data is predicted from all other parts.  A wider law must lower the
-geometric mean of the rms errors by `WORTH`, even with one standard error added.  Small motion may
-reject this law.  Otherwise H is a sum of plays, with finer thresholds as long as held-out blocks
-err less.  The error of the fit itself would prefer laws that are too wide.
+geometric mean of the rms errors by `LAW_GAIN`, even with one standard error added.  Small motion
+may reject this law.  Otherwise H is a sum of plays, with finer thresholds as long as held-out
+blocks err less.  The error of the fit itself would prefer laws that are too wide.
 """
 
 from __future__ import annotations
@@ -188,8 +188,8 @@ def choose_law(
     Choose the law of H by parts of the data that are predicted from all others.
 
     `others` is small motion, on which a wider law must err at most `NO_WORSE` times as much as
-    plays.  A law with lags must err by `WORTH` less than plays, because under a triangle of one
-    speed creep looks like a lag along the path.
+    plays.  A law with lags must err by `LAW_GAIN` less than plays, because under a triangle of
+    one speed creep looks like a lag along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
     low = min(e.span[0] for e in excerpts)
