@@ -327,9 +327,8 @@ class Effect:
             if p.is_amplitude and (moved is None or p.name in moved)
             for i in (range(np.size(values[p.name])) if p.vector else (None,))
         )
-        own = steps or {}
-        far = tuple(float(own.get(name, known[name].step)) for name, _ in moves)
-        return Trial(values, moves, far)
+        far = {**{name: p.step for name, p in known.items()}, **(steps or {})}
+        return Trial(values, moves, tuple(float(far[name]) for name, _ in moves))
 
     def slopes(self, block: Block) -> Mapping[str, Array]:
         """
