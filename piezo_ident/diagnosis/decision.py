@@ -236,28 +236,22 @@ class Decision:
 
 def decide(candidates: Candidates) -> Decision:
     """Decide between candidates."""
-    bests = [c for c in candidates.bests if candidates.is_admissible(c.effects)]
-    if not bests:
-        return _set_in(candidates)
-    best = simplest(bests, candidates.left, lambda c: c.size, ALIKE)
-    rivals = _rivals_of(candidates, best)
+    bests = tuple(c for c in candidates.bests if candidates.is_admissible(c.effects))
+    found = bests or candidates.like_refit()
+    # only labels tell the earlier error on other motion
+    if not (bests or (candidates.rows.kinds and found and found[0].effects != (OF_MATERIALS,))):
+        return Decision(None, candidates.left(candidates.without()))
+    best = simplest(found, candidates.left, lambda c: c.size, ALIKE)
+    if bests:
+        whole = candidates.left(candidates.without(best.effects))
+        rivals = _rivals_of(candidates, best)
+    else:
+        whole, most = candidates.given, RIVALS * candidates.left(best)
+        rivals = tuple(c.effects for c in found if c is not best and candidates.left(c) <= most)
     common = set(best.effects).intersection(*rivals)
     names = dict.fromkeys(itertools.chain(best.effects, *rivals))
     told = tuple(n for n in names if n not in common)
-    return Decision(best, candidates.left(candidates.without(best.effects)), told)
-
-
-def _set_in(candidates: Candidates) -> Decision:
-    """Decide whether an effect has set in, if no set is admissible beside the best H."""
-    found = candidates.like_refit()
-    # only labels tell the earlier error on other motion
-    if not found or not candidates.rows.kinds or found[0].effects == (OF_MATERIALS,):
-        return Decision(None, candidates.left(candidates.without()))
-    best = simplest(found, candidates.left, lambda c: c.size, ALIKE)
-    most = RIVALS * candidates.left(best)
-    rivals = [c for c in found if c is not best and candidates.left(c) <= most]
-    names = tuple(c.effects[0] for c in (best, *rivals)) if rivals else ()
-    return Decision(best, candidates.given, names, set_in=True)
+    return Decision(best, whole, told, set_in=not bests)
 
 
 def _rivals_of(candidates: Candidates, best: FittedSet) -> tuple[tuple[str, ...], ...]:

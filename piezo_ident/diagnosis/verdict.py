@@ -154,7 +154,8 @@ def _class(names: Sequence[str], untried: Collection[str], effects: Sequence[str
 
 def _hidden(candidates: Candidates) -> Class | None:
     """Return effects that do most of the work of another H, as this H may hide one of them."""
-    found = [c.effects[0] for c in candidates.like_refit()]
+    # the same effect may stand there beside a retuned G, too
+    found = list(dict.fromkeys(c.effects[0] for c in candidates.like_refit()))
     if len(found) == 1:
         found += [n for n in look_alikes(found[0]) if find_effect(n).rate_independent][:1]
     if len(found) < 2:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 from piezo_ident.diagnosis import criteria
 from piezo_ident.diagnosis.decision import Candidates, decide, FittedSet
+from piezo_ident.diagnosis.verdict import _hidden
 import pytest
 
 N, NOISE = 4000, 1e-8
@@ -166,6 +167,11 @@ def test_without_labels_nothing_is_said_to_have_set_in(given):
 def test_others_that_have_set_in_are_rivals(given):
     some = [beside_given('backlash', 0.8 * WHOLE), beside_given('saturation', 1.2 * WHOLE)]
     assert decide(given.and_these(some)).names == ('backlash', 'saturation')
+    # an effect beside a retuned G is no rival of itself
+    retuned = found('backlash', left=1.2 * WHOLE, way='given', retuning=(0.1,))
+    both = given.and_these([some[0], retuned])
+    assert decide(both).names == ()
+    assert _hidden(both).names == ('backlash', 'saturation')
 
 
 @pytest.mark.parametrize(('left', 'is_class'), [(0.2, True), (0.01, False)])
