@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from piezo_ident.diagnosis.criteria import SMALLEST_EFFECT
 from piezo_ident.diagnosis.equations import held_out_errors, normal_equations, with_columns
-from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, POLISH, POLISHING, tried
+from piezo_ident.diagnosis.joint_fit import fit_jointly, Fitted, polished, tried
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import cost_of_decays, CREEP, State
 from piezo_ident.effects.creep import AT_ONCE
@@ -85,10 +86,5 @@ def _is_possible(simulator: Simulator, state: State) -> bool:
 
 def _refitted(simulator: Simulator, state: State) -> Fitted:
     """Fit a state, again and again with fresh columns of H, as long as the error falls."""
-    fitted = fit_jointly(simulator, state)
-    for _ in range(POLISHING):
-        fresh = fit_jointly(simulator, fitted.state)
-        if fresh.mean_square > (1.0 - POLISH) * fitted.mean_square:
-            break
-        fitted = fresh
-    return fitted
+    fit = partial(fit_jointly, simulator)
+    return polished(fit, fit(state))

@@ -220,6 +220,16 @@ def tried(fit: Callable[P, Fitted], *args: P.args, **kwargs: P.kwargs) -> Fitted
     return None
 
 
+def polished(again: Callable[[State], Fitted | None], fitted: Fitted) -> Fitted:
+    """Fit again from the fitted state while the fit works and gains `POLISH` of the error."""
+    for _ in range(POLISHING):
+        fresh = again(fitted.state)
+        if fresh is None or not fresh.mean_square <= (1.0 - POLISH) * fitted.mean_square:
+            break
+        fitted = fresh
+    return fitted
+
+
 class _Fit:
     """A fit under way; `loss` is the sum of squares of the rows and of the pull."""
 

@@ -22,15 +22,7 @@ from piezo_ident.common.errors import IdentificationError
 from piezo_ident.diagnosis.criteria import ALIKE, PASSES, TAKES
 from piezo_ident.diagnosis.decision import Candidates, change_g, FittedSet
 from piezo_ident.diagnosis.equations import BaseColumns, held_out_errors, normal_equations, Pull
-from piezo_ident.diagnosis.joint_fit import (
-    fit_base,
-    fit_jointly,
-    Fitted,
-    POLISH,
-    POLISHING,
-    tried,
-    Until,
-)
+from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly, Fitted, polished, tried, Until
 from piezo_ident.diagnosis.rows import means
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import RETUNING, State
@@ -185,13 +177,8 @@ def with_numerator(simulator: Simulator, step: FittedSet) -> FittedSet:
         if mode is None:
             continue
         for a in (model.dynamics.a, _poles_of(*mode, model.sample_rate)):
-            last = step
-            for _ in range(POLISHING):
-                fitted = tried(_with_other_numerator, simulator, last.fitted.state, a)
-                most = (1.0 - POLISH) * last.fitted.mean_square
-                if fitted is None or not fitted.mean_square <= most:
-                    break
-                last = replace(last, fitted=fitted)
+            again = partial(tried, _with_other_numerator, simulator, a)
+            last = replace(step, fitted=polished(again, step.fitted))
             best = min(best, last, key=lambda one: one.fitted.mean_square)
     return best
 
@@ -203,7 +190,7 @@ def _poles_of(frequency: float, damping: float, sample_rate: float) -> Array:
     return np.array([-2.0 * pole.real, abs(pole) ** 2])
 
 
-def _with_other_numerator(simulator: Simulator, state: State, a: Array) -> Fitted:
+def _with_other_numerator(simulator: Simulator, a: Array, state: State) -> Fitted:
     """Fit the taps of G behind poles a_1, a_2, ..., and then all else."""
     rows, model = simulator.rows, simulator.model
     G, delay = model.dynamics, model.delay.samples

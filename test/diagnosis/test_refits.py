@@ -143,7 +143,7 @@ def test_a_drift_that_is_left_out_leaves_the_zero_where_it_was(refit):
 def test_a_failed_fit_of_the_numerator_keeps_the_step(monkeypatch):
     tried = []
 
-    def fails(simulator, state, a):
+    def fails(simulator, a, state):
         tried.append(np.array(a))
         raise ModelError('no such filter')
 
