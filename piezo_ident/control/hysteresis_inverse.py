@@ -22,13 +22,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel, ordered_kernel
+from piezo_ident.effects.moving_plays import edges, Growth
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.kernels import curve, curve_slope, held
+from piezo_ident.operators.kernels import curve, curve_slope, held, lag_after
 
 #: largest error of H at a root, normalised
 TOLERANCE = 1e-13
@@ -48,11 +48,11 @@ def _plays(u: float, band: Array, q: Array, memory: Array, after: Array) -> tupl
     """
     Compute the sum of the plays of H at u and its slope; write the plays to `after`.
 
-    Each play may lag u by ``band[0]`` and lead it by ``band[1]``.
+    Each play stays between ``u + band[0]`` and ``u + band[1]``.
     """
     w, slope = 0.0, 0.0
     for i in range(q.size):
-        f = held(memory[i], u - band[0, i], u + band[1, i])
+        f = held(memory[i], u + band[0, i], u + band[1, i])
         after[i] = f
         w += q[i] * f
         slope += 0.0 if f == memory[i] else q[i]
@@ -66,7 +66,7 @@ def _wide_plays(
     """Do the same as `_plays` with curves and bias; one loop is a third faster than two."""
     w, slope = 0.0, 0.0
     for i in range(q.size):
-        f = held(memory[i], u - band[0, i], u + band[1, i])
+        f = held(memory[i], u + band[0, i], u + band[1, i])
         after[i] = f
         t = f - low
         w += q[i] * f + c[3, i] * (u - low) * t + curve(c, i, t)
@@ -93,9 +93,7 @@ def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
         c2 = d2 - 3.0 * b * d3
         c1 = d1 - 2.0 * b * c2
         c0 = -b * c1
-        new = c0 + u * (c1 + u * (c2 + u * d3))
-        old = c0 + last * (c1 + last * (c2 + last * d3))
-        after[j] = new + (z[j] - old) * left
+        after[j] = lag_after(z[j], c0, c1, c2, d3, last, u, left)
         behind = u * (d1 + u * (d2 + u * d3)) - after[j]
         w -= behind
         slope += way * a * behind - (d1 + u * (2.0 * d2 + u * 3.0 * d3))
@@ -107,7 +105,7 @@ def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
 def _invert(
     wanted: Array,
     power: Array,
-    growth: Array,
+    growth: Growth,
     r: Array,
     q: Array,
     p1: float,
@@ -133,16 +131,12 @@ def _invert(
     """
     after, grows = memory.copy(), power.size > 0
     band = np.zeros((2, r.size))
-    band[0] = r
+    band[0] = -r
     u, w, slope, v = last[0], last[1], last[2], last[3]
     for k in range(wanted.size):
         goal, start = wanted[k], u
-        if grows:
-            s = power[k]
-            for i in range(r.size):
-                width = r[i] * (1.0 + growth[1] * s) + growth[0] * s
-                band[0, i] = max(width, 0.0)
-                band[1, i] = max(r[i] * (growth[3] * s) + growth[2] * s, -band[0, i])
+        for i in range(r.size if grows else 0):
+            band[0, i], band[1, i] = edges(0.0, r[i], power[k], growth)
         lowest, highest = max(least, v - step), min(most, v + step)
         # bracket of the voltage of H
         below = pole * start + (1.0 - pole) * lowest
@@ -197,7 +191,7 @@ class HysteresisInverse:
         Largest change of the voltage from one sample to the next.
     pole : float, optional
         Pole of a lag before H: ``u(k) = pole u(k-1) + (1 - pole) v(k)``.
-    growth : array_like, shape (4,), optional
+    growth : tuple of four float, optional
         Growth of the plays with a power of the speed: gain, stretch, lead and lead_stretch of
         `rate_dependent_hysteresis`.
 
@@ -230,14 +224,14 @@ class HysteresisInverse:
         limits: tuple[float, float] = (-np.inf, np.inf),
         step: float = np.inf,
         pole: float = 0.0,
-        growth: ArrayLike = (0.0, 0.0, 0.0, 0.0),
+        growth: Growth = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
         self.hysteresis = hysteresis = rising(hysteresis)
         lags = hysteresis.relaxations
         self._parameters = (*hysteresis.for_kernel, np.empty((0, 4)) if lags is None else +lags)
         self.limits = _rising_limits(hysteresis, float(limits[0]), float(limits[1]))
         self._bounds = (*self.limits, float(step), float(pole))
-        self._growth = np.array(growth, dtype=np.float64)
+        self._growth = growth
         self._memory = self._last = np.zeros(0)
 
     def reset(self, u0: float) -> float:

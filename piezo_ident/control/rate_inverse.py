@@ -24,7 +24,7 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, rising
 from piezo_ident.control.linear_inverse import smoothed
 from piezo_ident.control.rate_tangent import tangent
-from piezo_ident.effects.rate_dependent_hysteresis import AMPLITUDES, RateDependentHysteresis
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
 from piezo_ident.operators.chain import Block
 from piezo_ident.operators.hysteresis import Hysteresis
 from scipy.sparse.linalg import LinearOperator, lsmr
@@ -84,8 +84,7 @@ class RateInverse:
     ) -> None:
         hysteresis = rising(hysteresis)
         self._effect = RateDependentHysteresis(sample_rate, parameters, hysteresis)
-        growth = [self._effect.number(name) for name in AMPLITUDES]
-        self._inverse = HysteresisInverse(hysteresis, limits, step, growth=growth)
+        self._inverse = HysteresisInverse(hysteresis, limits, step, growth=self._effect.growth)
         self._smoothing = SMOOTH * self._effect.number('cutoff'), sample_rate
         self._step = float(step)
         self._u0, self._before = 0.0, np.empty(0)

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.kernel import kernel, ordered_kernel
-from piezo_ident.effects.rate_dependent_hysteresis import AMPLITUDES, RateDependentHysteresis
-from piezo_ident.operators.kernels import curve_slope
+from piezo_ident.effects.moving_plays import edges, Growth
+from piezo_ident.effects.rate_dependent_hysteresis import RateDependentHysteresis
+from piezo_ident.operators.kernels import curve_slope, held
 from scipy.sparse.linalg import LinearOperator
 
 #: edges and weights of the plays, slopes of their lower and upper edges by the power of the speed,
@@ -35,7 +36,7 @@ def tangent(effect: RateDependentHysteresis, u: Array, u0: float) -> LinearOpera
     h = effect.hysteresis
     r, q, p1, p2, p0, low, c = h.for_kernel
     power, slope = effect.power_and_slope(np.ascontiguousarray(u), u0)
-    growth = np.array([effect.number(name) for name in AMPLITUDES])
+    growth = effect.growth
     rest = h.initial_memory(u0)
     memory = np.append(rest, np.zeros(r.size - rest.size))
     edge = np.empty((u.size, r.size), dtype=np.int8)
@@ -60,7 +61,7 @@ def _edges(
     u: Array,
     power: Array,
     r: Array,
-    growth: Array,
+    growth: Growth,
     low: float,
     c: Array,
     memory: Array,
@@ -72,13 +73,9 @@ def _edges(
     for k in range(u.size):
         x, s = u[k], power[k]
         for i in range(r.size):
-            width = max(r[i] * (1.0 + growth[1] * s) + growth[0] * s, 0.0)
-            ahead = max(r[i] * (growth[3] * s) + growth[2] * s, -width)
-            edge[k, i] = 0
-            if memory[i] > x + ahead:
-                memory[i], edge[k, i] = x + ahead, 1
-            if memory[i] < x - width:
-                memory[i], edge[k, i] = x - width, -1
+            lower, upper = edges(0.0, r[i], s, growth)
+            edge[k, i] = 1 if memory[i] > x + upper else -1 if memory[i] < x + lower else 0
+            memory[i] = held(memory[i], x + lower, x + upper)
             if c.shape[0]:
                 t = memory[i] - low
                 line[k] += c[3, i] * t

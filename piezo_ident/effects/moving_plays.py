@@ -22,7 +22,7 @@ Growth = tuple[float, float, float, float]
 
 
 @ordered_kernel
-def _edges(x: float, r: float, power: float, growth: Growth) -> tuple[float, float]:
+def edges(x: float, r: float, power: float, growth: Growth) -> tuple[float, float]:
     """Compute the edges of the band of a play; if they cross, the lower edge counts."""
     gain, stretch, lead, lead_stretch = growth
     width = r * (1.0 + stretch * power) + gain * power
@@ -59,7 +59,7 @@ def growth_of_plays(
         for i in range(n_r):
             still[i] = held(still[i], x - r[i], x)
         for i in range(n_r):
-            low, high = _edges(x, r[i], p, growth)
+            low, high = edges(x, r[i], p, growth)
             memory[i] = held(memory[i], low, high)
         for i in range(n_r):
             w += q[i] * (memory[i] - still[i])
@@ -74,7 +74,7 @@ def growth_of_plays(
 def moved_play(v: Array, r: float, power: Array, growth: Growth, f: float, out: Array) -> None:
     """Write a play whose threshold grows into `out`, shape (n,); f is its output before."""
     for k in range(v.size):
-        low, high = _edges(v[k], r, power[k], growth)
+        low, high = edges(v[k], r, power[k], growth)
         f = held(f, low, high)
         out[k] = f
 
@@ -95,7 +95,7 @@ def moved_plays_apart(
     for k in range(v.size):
         x, p = v[k], power[k]
         for i in range(r.size):
-            low, high = _edges(x, r[i], p, growth)
+            low, high = edges(x, r[i], p, growth)
             memory[i] = held(memory[i], low, high)
         out[0, k], out[1, k], out[2, k], out[3, k] = four_sums(low_v, q, c, memory)
 
@@ -129,7 +129,7 @@ def growth_slopes(
         x, p = v[k], power[k]
         bend_1, bend_2, bend_3 = bends[0, k], bends[1, k], bends[2, k]
         for i in range(n_r):
-            low, high = _edges(x, r[i], p, growth)
+            low, high = edges(x, r[i], p, growth)
             f = memory[i]
             new = held(f, low, high)
             memory[i] = new

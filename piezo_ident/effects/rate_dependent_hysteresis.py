@@ -89,9 +89,9 @@ class RateDependentHysteresis(Effect):
     )
 
     def prepare(self) -> None:
-        """Read the amplitudes, and compute the pole of the low-pass of the speed."""
+        """Read the amplitudes as `growth`, and compute the pole of the low-pass of the speed."""
         gain, stretch, lead, lead_stretch = map(self.number, AMPLITUDES)
-        self._growth = gain, stretch, lead, lead_stretch
+        self.growth = gain, stretch, lead, lead_stretch
         self.pole = float(np.exp(-2 * np.pi * self.number('cutoff') / self.sample_rate))
 
     @classmethod
@@ -136,7 +136,7 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = self.hysteresis.for_kernel
         power = self._power(v, self._speed)
         more = np.empty(v.size)
-        growth_of_plays(v, r, q, low, c, power, self._growth, self._memory, self._still, more)
+        growth_of_plays(v, r, q, low, c, power, self.growth, self._memory, self._still, more)
         inner = self.inner.process(block)
         return inner.with_signal(inner.x + more)
 
@@ -146,7 +146,7 @@ class RateDependentHysteresis(Effect):
         r, q, *_, low, c = self.hysteresis.for_kernel
         power, bends = self._bent_power(v)
         out = np.empty((len(AMPLITUDES) + len(SHAPE), v.size))
-        growth_slopes(v, r, q, low, c, power, bends, self._growth, self._memory.copy(), out)
+        growth_slopes(v, r, q, low, c, power, bends, self.growth, self._memory.copy(), out)
         return dict(zip((*AMPLITUDES, *SHAPE), out, strict=True))
 
     def of_parts(
@@ -163,7 +163,7 @@ class RateDependentHysteresis(Effect):
             elif is_single_play(h):
                 for one, start in group:
                     out = np.empty(v.size)
-                    moved_play(v, one.thresholds[0], power, self._growth, start[0], out)
+                    moved_play(v, one.thresholds[0], power, self.growth, start[0], out)
                     yield one.weights[0] * out
             elif has_curves_alone(h):
                 yield from self._moved_apart(v, power, group)
@@ -177,7 +177,7 @@ class RateDependentHysteresis(Effect):
         moved, out = np.zeros(r.size), np.empty((SIDE_BY_SIDE, v.size))
         moved[: memory.size] = memory
         q, curves = weights_of(group)
-        moved_plays_apart(v, r, low, q, curves, power, self._growth, moved, out)
+        moved_plays_apart(v, r, low, q, curves, power, self.growth, moved, out)
         return out[: len(group)]
 
     def c_code(self) -> CCode:
