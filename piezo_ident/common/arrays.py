@@ -63,6 +63,18 @@ def real_array(values: ArrayLike, where: str = 'array') -> Array:
     raise DataError(f'{where}: expected real numbers, got {got}; {cure}')
 
 
+def finite_vector(values: ArrayLike, verb: str, name: str, of: str, least: int = 0) -> Array:
+    """Convert a signal of a verb to a vector of finite numbers, or raise DataError."""
+    x = real_array(values, f'{verb}, {name}')
+    if x.ndim != 1 or x.size < least or not np.isfinite(x).all():
+        bad = np.count_nonzero(~np.isfinite(x))
+        raise DataError(
+            f'{verb}: the {name} has the shape {x.shape} and {bad} bad or masked numbers; it must '
+            f'be a vector of {of}'
+        )
+    return x
+
+
 def true_runs(mask: Mask) -> list[tuple[int, int]]:
     """List the runs of true values, each as its first place and the place behind its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))

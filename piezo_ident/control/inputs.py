@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, real_array
+from piezo_ident.common.arrays import Array, finite_vector, real_array
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.expectation import known_rms
 from piezo_ident.model.stage_model import StageModel
@@ -25,14 +25,9 @@ FAR, FAINT = 30.0, 2e-3
 
 def checked_motion(wanted: ArrayLike) -> Array:
     """Convert a wanted motion to a vector, or raise DataError."""
-    y = real_array(wanted, 'invert, wanted motion')
-    if y.ndim != 1 or y.size < 2 or not np.all(np.isfinite(y)):
-        bad = np.count_nonzero(~np.isfinite(y))
-        raise DataError(
-            f'invert: the wanted motion has the shape {y.shape} and {bad} bad numbers; it must be '
-            'a vector of at least two finite numbers, in metres'
-        )
-    return y
+    return finite_vector(
+        wanted, 'invert', 'wanted motion', 'at least two finite numbers, in metres', least=2
+    )
 
 
 def check_rate(rate: float, sample_rate: float | None) -> None:

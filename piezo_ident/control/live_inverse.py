@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, Mask
+from piezo_ident.common.arrays import Array, finite_vector, Mask
 from piezo_ident.common.errors import DataError
 from piezo_ident.control.hysteresis_inverse import HysteresisInverse, with_rising_hysteresis
 from piezo_ident.control.inputs import checked_limits, SHORT
@@ -235,11 +235,7 @@ class LiveInverse:
         DataError
             When the wanted motion is not a vector of finite numbers.
         """
-        y = np.asarray(wanted, dtype=np.float64)
-        if y.ndim != 1 or not np.isfinite(y).all():
-            raise DataError(
-                'live inverse: the wanted motion must be a vector of finite numbers, in metres'
-            )
+        y = finite_vector(wanted, 'live inverse', 'wanted motion', 'finite numbers, in metres')
         s = self.model.scaling
         x = d = s.x(y)
         w = np.full(x.size, self._passes[0].origin)

@@ -18,7 +18,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
-from piezo_ident.common.arrays import Array, Mask, real_array
+from piezo_ident.common.arrays import Array, finite_vector, Mask
 from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.effects import find_effect
 from piezo_ident.effects.creep import Creep
@@ -243,13 +243,7 @@ class StageModel(FrontDoor):
         >>> f'{1e6 * model.simulate([0.0] * 3 + [10.0] * 997)[-1]:.1f} um'
         '71.3 um'
         """
-        x = real_array(v, 'simulate, voltage')
-        if x.ndim != 1 or not np.all(np.isfinite(x)):
-            bad = np.count_nonzero(~np.isfinite(x))
-            raise DataError(
-                f'simulate: the voltage has the shape {x.shape} and {bad} bad or masked numbers; '
-                'it must be a vector of finite numbers in volts'
-            )
+        x = finite_vector(v, 'simulate', 'voltage', 'finite numbers in volts')
         if not x.size:
             return np.empty(0)
         piece = Piece(x, x, self.sample_rate, channels=channels or {})  # type: ignore[arg-type]
