@@ -147,6 +147,14 @@ def test_a_mode_that_rings_at_every_step_is_no_line():
     assert line.frequency == pytest.approx(50.03, abs=0.002)
 
 
+def test_a_sine_in_one_half_of_a_rest_is_no_line():
+    hum, rest = 1.2e-9 * np.sin(2 * np.pi * 50.03 * T), np.zeros(V.size)
+    for wave, count in ((0.5 * hum, 1), (hum * (T > 0.5 * T[-1]), 0)):
+        e = noise(np.random.default_rng(2)) + wave
+        part = ResidualPart('r', Piece(rest, 0.1 * Y_HAT + e, RATE), e)
+        assert len(search(part).lines) == count
+
+
 def test_two_rests_far_apart_agree_on_one_frequency():
     rng, hertz = np.random.default_rng(10), 50.087
     v = np.zeros(130_000)
