@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 import piezo_ident as pi
 from piezo_ident.report.figures import style
-from piezo_ident.report.html import Link, Page, page_html, Section, Shown, Step
+from piezo_ident.report.html import FileLink, Page, page_html, Section, Shown, Step
 from piezo_ident.report.table import number, Table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -410,7 +410,7 @@ def write_page(out: Path, session: Session, lines: Sequence[str]) -> Path:
             *bag,
             _played(recorded.commands if recorded else ()),
             *again,
-            Section('Read on', [Link(href, text) for href, text in links.items()]),
+            Section('Read on', [FileLink(href, text) for href, text in links.items()]),
             Section('What happened', [Step('seconds since the start', '\n'.join(lines))]),
         ],
         after=[],

@@ -27,7 +27,7 @@ from piezo_ident.model.stage_model import EffectSetting, StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.selection.comparison import Candidate, shown_effect
+from piezo_ident.selection.comparison import RatedFit, shown_effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class FreeRunFits:
     parts: Sequence[Mask]
     judged: Fit
     last: Fit
-    candidates: Sequence[Candidate]
-    best: Candidate
+    candidates: Sequence[RatedFit]
+    best: RatedFit
 
 
 def outcome_of(

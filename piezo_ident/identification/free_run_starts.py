@@ -26,7 +26,7 @@ from piezo_ident.identification.solvers.arx import factor_of, stabilised
 from piezo_ident.identification.step1_delay import MAX_DELAY
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName
-from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, candidate, shown_effect
+from piezo_ident.selection.comparison import ALIKE, best_of, rated, RatedFit, shown_effect
 from scipy.signal import butter, sosfilt
 
 #: orders na of G that are tried, with nb = na + 1 or the largest, and the orders of rough fits
@@ -163,7 +163,7 @@ class Search:
     allowed: Allowed
     tick: Callable[[], None]
 
-    def best(self) -> tuple[Candidate, tuple[Candidate, ...]]:
+    def best(self) -> tuple[RatedFit, tuple[RatedFit, ...]]:
         """
         Find the best candidate, and list all candidates.
 
@@ -183,7 +183,7 @@ class Search:
     def _unknown_starts(self) -> Search:
         return replace(self, guesses=np.where(self.guesses > 0.0, self.guesses, UNKNOWN))
 
-    def _needs_fitted_starts(self, one: Candidate) -> bool:
+    def _needs_fitted_starts(self, one: RatedFit) -> bool:
         """Tell whether a fitted memory at the starts at rest lowers the error enough."""
         if self.guesses.any(axis=1).all():
             return False
@@ -191,7 +191,7 @@ class Search:
         free = self._candidate('free start', self._fit(stage, FEW), 1)
         return best_of([one, free]) is free
 
-    def at_rest(self, candidates: Sequence[Candidate]) -> Candidate:
+    def at_rest(self, candidates: Sequence[RatedFit]) -> RatedFit:
         """
         Choose the best candidate; its starts are at rest unless fitted memories lower its error.
 
@@ -211,7 +211,7 @@ class Search:
         known = best_of([*rests, free])
         return best if known is free else known
 
-    def _orders(self, alone: Fit) -> list[Candidate]:
+    def _orders(self, alone: Fit) -> list[RatedFit]:
         # an order that is given decides against H alone
         is_given = self.allowed.order is not None
         candidates = [] if is_given else [self._candidate('hysteresis', alone)]
@@ -229,7 +229,7 @@ class Search:
             )
         return candidates + self._with_longer_delays(best_of(candidates))
 
-    def wider(self, best: Candidate, taus: Array) -> list[Candidate]:
+    def wider(self, best: RatedFit, taus: Array) -> list[RatedFit]:
         """Fit candidates with creep, with wider laws of H, and with both."""
         stage = best.fit.stage
         creeping = [self._more(best, 'creep', self._crept(stage, taus))]
@@ -242,11 +242,11 @@ class Search:
                 creeping.append(self._more(best, f'{law.name}, creep', crept))
         return [*creeping, *wider, *self._crept_before(creeping)]
 
-    def _more(self, best: Candidate, name: str, stage: Stage) -> Candidate:
+    def _more(self, best: RatedFit, name: str, stage: Stage) -> RatedFit:
         effects = int(stage.taus.size > 0)
         return self._candidate(f'{best.name}, {name}', self._fit(stage, MANY), effects)
 
-    def _crept_before(self, creeping: Sequence[Candidate]) -> list[Candidate]:
+    def _crept_before(self, creeping: Sequence[RatedFit]) -> list[RatedFit]:
         """Add creep of earlier motion to the best candidate with creep, if the error falls."""
         known = min(creeping, key=lambda c: c.error)
         if not known.fit.stage.resting.any():
@@ -266,9 +266,9 @@ class Search:
             return crept
         return replace(crept, dynamics=faster.normalised())
 
-    def _with_longer_delays(self, best: Candidate) -> list[Candidate]:
+    def _with_longer_delays(self, best: RatedFit) -> list[RatedFit]:
         """Replace the first coefficient of B by a sample of delay, while `best_of` prefers it."""
-        accepted: list[Candidate] = []
+        accepted: list[RatedFit] = []
         one = best
         while one.fit.stage.dynamics.b.size > 1 and self.allowed.is_free:
             stage = one.fit.stage
@@ -282,8 +282,8 @@ class Search:
             accepted.append(one)
         return accepted
 
-    def _candidate(self, name: str, one: Fit, effects: int = 0) -> Candidate:
-        return candidate(name, one, self.sets, self.kinds, effects)
+    def _candidate(self, name: str, one: Fit, effects: int = 0) -> RatedFit:
+        return rated(name, one, self.sets, self.kinds, effects)
 
     def _fit(self, stage: Stage, steps: int) -> Fit:
         return fit(stage, self.stretches, iterations=steps, tick=self.tick)

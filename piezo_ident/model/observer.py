@@ -242,7 +242,7 @@ class Observer:
         now[kernel.MISFIT] = law.numbers[kernel.ERROR]
         now[kernel.IDLE] = self._gain * law.numbers[kernel.GAIN_SIZE]
         x, weight, group = np.zeros((count, n)), np.zeros(count), np.full((2, self._group), np.nan)
-        self._state = kernel.State(x, P, weight, self._row.copy(), group, np.zeros(c), now)
+        self._state = kernel.FilterState(x, P, weight, self._row.copy(), group, np.zeros(c), now)
         kernel.tell(law, self._state)
         self._input.reset(u0, u0)
         self._output.reset(u0, 0.0)

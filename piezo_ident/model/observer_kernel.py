@@ -28,7 +28,7 @@ LIKELY = 3.0
 #: error (taste)
 STROKES = 10.0
 
-# places in `State.now`
+# places in `FilterState.now`
 COUNT, PATH, BAND, MOVED, SPREAD, SCALE, REFUSED, SCORES, READING, BEGAN = range(10)
 OFFSET, OFFSET_VAR, CREEP, CREEP_VAR, VAR, MISFIT = range(10, 16)
 # for the gain: FREE, mean free run of the group; IDLE, variance of the gain that waits for motion;
@@ -57,7 +57,7 @@ class Law(NamedTuple):
     numbers: Array
 
 
-class State(NamedTuple):
+class FilterState(NamedTuple):
     """Variables of a filter: the states of b hypotheses, and the present group of samples."""
 
     x: Array  # (b, n)
@@ -91,13 +91,13 @@ def _typical(group: Array, noise: float) -> tuple[float, float, int]:
 
 
 @ordered_kernel
-def _has_gain(law: Law, s: State) -> bool:
+def _has_gain(law: Law, s: FilterState) -> bool:
     # the states are offset, creep, the gain behind its drift if they are followed, and m
     return s.row.size > law.lead.size + 2
 
 
 @ordered_kernel
-def _let_gain_drift(law: Law, s: State, moved: float) -> None:
+def _let_gain_drift(law: Law, s: FilterState, moved: float) -> None:
     # time makes the gain drift, and this counts along the path only, as the variance of the gain
     now, d = s.now, s.row.size - 3
     now[WAITING] += law.numbers[STEP]
@@ -109,7 +109,7 @@ def _let_gain_drift(law: Law, s: State, moved: float) -> None:
 
 
 @ordered_kernel
-def _let_time_pass(law: Law, s: State) -> None:
+def _let_time_pass(law: Law, s: FilterState) -> None:
     numbers, now = law.numbers, s.now
     hypotheses, n = s.x.shape
     phi = np.exp(-now[PATH] / numbers[LENGTH])
@@ -141,7 +141,7 @@ def _let_time_pass(law: Law, s: State) -> None:
 
 
 @ordered_kernel
-def _innovation(s: State, b: int, mean: float, noise: float) -> tuple[float, float]:
+def _innovation(s: FilterState, b: int, mean: float, noise: float) -> tuple[float, float]:
     off, power = mean, noise
     for i in range(s.row.size):
         off -= s.row[i] * s.x[b, i]
@@ -151,7 +151,7 @@ def _innovation(s: State, b: int, mean: float, noise: float) -> tuple[float, flo
 
 
 @ordered_kernel
-def _rescale(law: Law, s: State, scale: float) -> None:
+def _rescale(law: Law, s: FilterState, scale: float) -> None:
     # changes the scale of the errors; m grows at once with it, or the scale would run away
     scale = max(1.0, scale)
     more = max(0.0, scale - s.now[SCALE]) * law.numbers[ERROR]
@@ -193,7 +193,7 @@ def _is_gain(law: Law, now: Array) -> bool:
 
 
 @ordered_kernel
-def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
+def _is_believed(law: Law, s: FilterState, mean: float, count: int) -> bool:
     # the hypothesis that fits best judges a measurement; lasting refusals are believed in the end
     numbers, now = law.numbers, s.now
     noise = now[SCALE] * numbers[NOISE] / count
@@ -231,7 +231,7 @@ def _is_believed(law: Law, s: State, mean: float, count: int) -> bool:
 
 
 @ordered_kernel
-def _measure(law: Law, s: State, mean: float, count: int) -> None:
+def _measure(law: Law, s: FilterState, mean: float, count: int) -> None:
     numbers, now = law.numbers, s.now
     hypotheses, n = s.x.shape
     noise = now[SCALE] * numbers[NOISE] / count
@@ -253,7 +253,7 @@ def _measure(law: Law, s: State, mean: float, count: int) -> None:
 
 
 @ordered_kernel
-def tell(law: Law, s: State) -> None:
+def tell(law: Law, s: FilterState) -> None:
     """Average the corrections over the hypotheses, with their variances, and note them."""
     now = s.now
     share = np.exp(s.weight)
@@ -296,7 +296,7 @@ def tell(law: Law, s: State) -> None:
 
 
 @ordered_kernel
-def _gain_std(law: Law, s: State) -> float:
+def _gain_std(law: Law, s: FilterState) -> float:
     # A repeated motion repeats the error of the model, so time does not average out its slope.
     # Each of the two branches of a loop holds one independent error for two correlation lengths.
     if not _has_gain(law, s):
@@ -308,7 +308,7 @@ def _gain_std(law: Law, s: State) -> float:
 
 
 @ordered_kernel
-def _follow_drift(law: Law, s: State) -> None:
+def _follow_drift(law: Law, s: FilterState) -> None:
     # slope of the gain over time by weighted least squares; a gain of which little is known counts
     # little.  Neighbouring gains err alike, so their number does not reduce the deviation.
     now, dt, keep = s.now, law.numbers[STEP], 1.0 - 1.0 / law.numbers[FADE]
@@ -329,7 +329,7 @@ def _follow_drift(law: Law, s: State) -> None:
 
 
 @ordered_kernel
-def _end_group(law: Law, s: State) -> None:
+def _end_group(law: Law, s: FilterState) -> None:
     now = s.now
     own = now[MOVED] - now[SPREAD]
     _let_time_pass(law, s)
@@ -351,7 +351,7 @@ def _end_group(law: Law, s: State) -> None:
 
 
 @ordered_kernel
-def follow(y: Array, before: Array, free: Array, law: Law, s: State, out: Array) -> None:
+def follow(y: Array, before: Array, free: Array, law: Law, s: FilterState, out: Array) -> None:
     """
     Take y with free run, path and band of a horizon before; write the corrections to `out`.
 

@@ -57,7 +57,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Link:
+class FileLink:
     """Link to another file: its address relative to the page, and a description."""
 
     href: str
@@ -77,7 +77,7 @@ class Section:
     """Parts below a heading; None is left out.  Only `brief` sections are shown on a terminal."""
 
     title: str
-    parts: Sequence[Table | Shown | Step | Link | str | None]
+    parts: Sequence[Table | Shown | Step | FileLink | str | None]
     brief: bool = False
 
 

@@ -15,7 +15,7 @@ from piezo_ident.residual.coherence import Coherence, coherence
 from piezo_ident.residual.faults import find_faults
 from piezo_ident.residual.lines import find_lines, Line, without_lines
 from piezo_ident.residual.noise_floor import NoiseFloor, residual_noise_floor
-from piezo_ident.residual.stretches import all_stretches, block_means, ResidualPart, Stretch
+from piezo_ident.residual.stretches import all_stretches, block_means, DriveStretch, ResidualPart
 
 #: most samples of a curve after averaging, bins of a curve, bins in a decade of time or speed
 SAMPLES, BINS, PER_DECADE = 2**16, 24, 6
@@ -81,7 +81,7 @@ def analyse(parts: Sequence[ResidualPart]) -> ResidualAnalysis:
     )
 
 
-def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
+def _of_motions(parts: Sequence[ResidualPart], stretches: Sequence[DriveStretch]) -> list[Curve]:
     """Compute the mean residual over v and dv/dt, for both directions of the drive."""
     moving = [s for s in stretches if s.kind != 'rest']
     if not moving:
@@ -139,7 +139,7 @@ def _curve(
     return Curve(against, branch, centre[shown], mean[shown], std[shown])
 
 
-def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> list[Curve]:
+def _since_step(parts: Sequence[ResidualPart], stretches: Sequence[DriveStretch]) -> list[Curve]:
     """Compute the residual of the holds over lg t; each hold has its own offset."""
     holds = [s for s in stretches if s.kind == 'rest' and s.step != 0.0]
     if len(holds) < 2:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array, Integers, Mask, true_runs
 from piezo_ident.residual.beyond_drive import without_drive
-from piezo_ident.residual.stretches import block_means, ResidualPart, Stretch
+from piezo_ident.residual.stretches import block_means, DriveStretch, ResidualPart
 from scipy import fft, signal
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import maximum_filter1d, median_filter
@@ -84,7 +84,7 @@ class Series:
 
 
 def series_of(
-    parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
+    parts: Sequence[ResidualPart], stretches: Sequence[DriveStretch]
 ) -> tuple[list[Series], float, float]:
     """Collect the stretches that are long enough, their rate, and the highest frequency [Hz]."""
     found: list[Series] = []

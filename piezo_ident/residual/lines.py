@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from piezo_ident.common.arrays import Array
 from piezo_ident.residual.line_spectrum import FAINT, FEWEST, Series, series_of, Spectrum
-from piezo_ident.residual.stretches import ResidualPart, Stretch, strokes_of
+from piezo_ident.residual.stretches import DriveStretch, ResidualPart, strokes_of
 from scipy import fft
 from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc, gammaln
@@ -67,7 +67,7 @@ class LineSearch:
     searched: bool = False
 
 
-def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[Stretch]) -> LineSearch:
+def find_lines(parts: Sequence[ResidualPart], stretches: Sequence[DriveStretch]) -> LineSearch:
     """
     Search residuals of one sampling rate for narrow lines that are not locked to the drive.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from piezo_ident.common.arrays import Array, Integers
-from piezo_ident.residual.stretches import ResidualPart, Stretch
+from piezo_ident.residual.stretches import DriveStretch, ResidualPart
 from scipy import signal
 
 #: order of the slow change that is subtracted from a frame of differences
@@ -96,7 +96,7 @@ class _Reading(NamedTuple):
 
 
 def residual_noise_floor(
-    parts: Sequence[ResidualPart], stretches: Sequence[Stretch]
+    parts: Sequence[ResidualPart], stretches: Sequence[DriveStretch]
 ) -> NoiseFloor:
     """
     Estimate the noise floor of residuals.
@@ -138,7 +138,7 @@ def _white(parts: Sequence[ResidualPart]) -> NoiseFloor:
     return NoiseFloor(None, 'floor unknown: the voltage neither repeats three times nor rests')
 
 
-def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
+def _repeat(part: ResidualPart, s: DriveStretch) -> _Reading | None:
     p, rate = s.period, part.piece.sample_rate
     difference = part.e[s.start + 2 * p : s.stop] - part.e[s.start + p : s.stop - p]
     frame = min(max(p, round(FRAME * rate)), difference.size)
@@ -149,7 +149,7 @@ def _repeat(part: ResidualPart, s: Stretch) -> _Reading | None:
     return _reading(part, series, frame, min(p // 2, frame // 16), ORDER + 1)
 
 
-def _rest(part: ResidualPart, s: Stretch) -> _Reading | None:
+def _rest(part: ResidualPart, s: DriveStretch) -> _Reading | None:
     rate = part.piece.sample_rate
     skip = max(round(SETTLING * s.n), round(SETTLING_TIME * rate))
     n = s.n - skip

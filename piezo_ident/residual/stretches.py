@@ -93,7 +93,7 @@ class ResidualPart:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class DriveStretch:
     """
     A 'rest', 'repeat' or 'motion' of one part, from sample `start` to before `stop`.
 
@@ -127,18 +127,18 @@ def block_means(x: Array, m: int) -> Array:
     return np.asarray(x[: n * m].reshape(n, m) @ np.full(m, 1.0 / m))
 
 
-def all_stretches(parts: Sequence[ResidualPart]) -> list[Stretch]:
+def all_stretches(parts: Sequence[ResidualPart]) -> list[DriveStretch]:
     """Cut all parts into stretches, with the numbers of their parts."""
     return [s for i, part in enumerate(parts) for s in stretches_of(part, i)]
 
 
-def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
+def stretches_of(part: ResidualPart, number: int = 0) -> list[DriveStretch]:
     """Cut part `number` at rests, repeats and segments of its voltage, in order of time."""
     piece = part.piece
     v = piece.v
     shortest = _shortest(piece.sample_rate)
     still = [(a, b) for a, b in rests(v, piece.sample_rate) if b - a + 1 >= shortest]
-    found: list[Stretch] = []
+    found: list[DriveStretch] = []
     for first, last in part.runs():
         for s in piece.segments or (Segment('', 0, piece.n),):
             start, stop = max(s.start, first), min(s.stop, last)
@@ -151,7 +151,7 @@ def stretches_of(part: ResidualPart, number: int = 0) -> list[Stretch]:
                     continue
                 found += _motion(v, number, edge, a, shortest)
                 step = float(v[a] - v[max(a - shortest, 0)])
-                found.append(Stretch(number, a, b, 'rest', step=step))
+                found.append(DriveStretch(number, a, b, 'rest', step=step))
                 edge = b
             found += _motion(v, number, edge, stop, shortest)
     return found
@@ -184,18 +184,18 @@ def rests(v: Array, rate: float) -> list[tuple[int, int]]:
     return true_runs(still)
 
 
-def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list[Stretch]:
+def _motion(v: Array, number: int, start: int, stop: int, shortest: int) -> list[DriveStretch]:
     """Cut a motion into repeating stretches, and the stretches between them."""
     if stop - start < shortest:
         return []
     found, edge = [], start
     for a, b, period in find_repeats(v[start:stop]):
         if start + a - edge >= shortest:
-            found.append(Stretch(number, edge, start + a, 'motion'))
-        found.append(Stretch(number, start + a, start + b, 'repeat', period))
+            found.append(DriveStretch(number, edge, start + a, 'motion'))
+        found.append(DriveStretch(number, start + a, start + b, 'repeat', period))
         edge = start + b
     if stop - edge >= shortest:
-        found.append(Stretch(number, edge, stop, 'motion'))
+        found.append(DriveStretch(number, edge, stop, 'motion'))
     return found
 
 

@@ -30,7 +30,7 @@ RESOLVED = 1e-20
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class RatedFit:
     """
     Fit with a name and its errors on held-out data.
 
@@ -61,20 +61,20 @@ class Candidate:
         return float(self.error / EFFECT**self.effects)
 
 
-def candidate(
+def rated(
     name: str, fit: Fit, sets: Integers, kinds: Integers | None, effects: int = 0
-) -> Candidate:
+) -> RatedFit:
     """Rate a fit; `sets` and `kinds` give the set of each block, -1 for blocks without a set."""
     blocks = float(fit.held_out(sets).sum() / fit.n)
     if kinds is None:
-        return Candidate(name, fit, blocks, blocks, effects)
+        return RatedFit(name, fit, blocks, blocks, effects)
     out = kinds >= 0
     left = fit.held_out(kinds)
     # only blocks of a kind were held out, so only their errors count
-    return Candidate(name, fit, blocks, float(left[out].sum() / fit.rows[out].sum()), effects)
+    return RatedFit(name, fit, blocks, float(left[out].sum() / fit.rows[out].sum()), effects)
 
 
-def best_of(candidates: Sequence[Candidate]) -> Candidate:
+def best_of(candidates: Sequence[RatedFit]) -> RatedFit:
     """
     Choose the candidate with the lowest price; of alike prices, the fewest parameters.
 
@@ -87,7 +87,7 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     return simplest(candidates, lambda c: c.price, lambda c: c.fit.stage.size, ALIKE)
 
 
-def shown_effect(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
+def shown_effect(candidates: Sequence[RatedFit], chosen: RatedFit) -> RatedFit | None:
     """Find the best candidate with more effects than `chosen`; None if it errs about as much."""
     more = [c for c in candidates if c.effects > chosen.effects]
     best = min(more, key=lambda c: c.error, default=None)

@@ -25,7 +25,7 @@ from piezo_ident.identification.settings import Settings
 from piezo_ident.model.files import model_from_dict, model_to_dict
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
-from piezo_ident.selection.comparison import Candidate
+from piezo_ident.selection.comparison import RatedFit
 import pytest
 
 LAW = HysteresisLaw('plays', np.array([0.3]), SPAN)
@@ -48,7 +48,7 @@ def test_deviations_of_the_powers_are_those_of_a_linear_fit():
     block = np.arange(n) * 10 // n
     stretch = Stretch(v, x, np.ones(n, dtype=bool), block, 1000.0)
     last = fit(replace(linear, coefficients=truth), [stretch], iterations=0)
-    best = Candidate('plays', last, 1.0, 1.0)
+    best = RatedFit('plays', last, 1.0, 1.0)
     result = _hysteresis_result(FreeRunFits((), (), last, last, (best,), best))
     expected = np.sqrt(np.diag(np.linalg.inv(X.T @ X)) * last.loss / n)
     assert_allclose(result.std, expected[:3], rtol=1e-6)
@@ -63,7 +63,7 @@ def fits_of(G, delay, u):
     stage = Stage.linear(LAW, G, delay, np.zeros((1, PARTS)))
     use = np.ones(u.size, dtype=bool)
     last = fit(stage, [Stretch(u, u, use, np.arange(u.size) * 10 // u.size, FS)], iterations=0)
-    best = Candidate('plays', last, 1.0, 1.0)
+    best = RatedFit('plays', last, 1.0, 1.0)
     return FreeRunFits((Excerpt(u, u, use),), (use,), last, last, (best,), best)
 
 

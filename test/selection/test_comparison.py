@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 from piezo_ident.fitting.stretch import Stretch
-from piezo_ident.selection.comparison import ALIKE, best_of, Candidate, EFFECT, shown_effect
+from piezo_ident.selection.comparison import ALIKE, best_of, EFFECT, RatedFit, shown_effect
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds
 
 
 def one(name, error, size=3, effects=0):
     fit = SimpleNamespace(stage=SimpleNamespace(size=size))
-    return Candidate(name, fit, error, error, effects)
+    return RatedFit(name, fit, error, error, effects)
 
 
 def test_the_least_error_wins_and_of_those_alike_the_smaller():
@@ -22,7 +22,7 @@ def test_the_least_error_wins_and_of_those_alike_the_smaller():
     assert best_of([one('large', 1.0, 9), one('small', 0.99 * ALIKE, 2)]).name == 'small'
     assert best_of([one('large', 1.0, 9), one('small', 1.01 * ALIKE, 2)]).name == 'large'
     # both ways of holding out count
-    assert Candidate('x', None, 4.0, 1.0).error == 2.0
+    assert RatedFit('x', None, 4.0, 1.0).error == 2.0
 
 
 def test_an_effect_has_to_take_most_of_what_is_left():

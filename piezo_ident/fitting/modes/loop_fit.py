@@ -41,7 +41,7 @@ Target = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Parameters:
+class FreeNumbers:
     """
     Which numbers of a model are fitted besides C, D and H, which always are.
 
@@ -58,7 +58,7 @@ class Parameters:
     @classmethod
     def of(
         cls, model: SharedModes, *, hold: Collection[str] = (), still: Collection[int] = ()
-    ) -> Parameters:
+    ) -> FreeNumbers:
         """
         Choose the parameters of a model.
 
@@ -117,7 +117,7 @@ def _arrays(model: SharedModes) -> dict[str, Array]:
 
 
 def output_sensitivities(
-    model: SharedModes, parameters: Parameters, run: Passage, skip: int = 0
+    model: SharedModes, parameters: FreeNumbers, run: Passage, skip: int = 0
 ) -> NDArray[np.float32]:
     """
     Return dy/dtheta of `parameters`, shape (samples - skip, outputs, parameters).
@@ -149,7 +149,7 @@ def loop_fit(
     Parameters
     ----------
     hold, still : collections
-        Parameters that are not fitted, see `Parameters.of`.
+        Parameters that are not fitted, see `FreeNumbers.of`.
 
     Returns
     -------
@@ -158,7 +158,7 @@ def loop_fit(
     """
     model = _ranged(model, records)
     with ThreadPoolExecutor(WORKERS) as pool:
-        problem = _Problem(model, records, Parameters.of(model, hold=hold, still=still), pool)
+        problem = _Problem(model, records, FreeNumbers.of(model, hold=hold, still=still), pool)
         model = descend(model, problem.cost, problem.equations, problem.step, SCHEDULE, iterations)
     return _ranged(model, records)
 
@@ -188,7 +188,7 @@ class _Problem:
         self,
         model: SharedModes,
         records: Sequence[PeriodicRecord],
-        parameters: Parameters,
+        parameters: FreeNumbers,
         pool: ThreadPoolExecutor,
     ) -> None:
         self.parameters, self.pool = parameters, pool

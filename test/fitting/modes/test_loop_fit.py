@@ -6,7 +6,7 @@ from dataclasses import replace
 import axes_stage as stage
 import numpy as np
 from piezo_ident.common.errors import ModelError
-from piezo_ident.fitting.modes.loop_fit import loop_fit, output_sensitivities, Parameters
+from piezo_ident.fitting.modes.loop_fit import FreeNumbers, loop_fit, output_sensitivities
 from piezo_ident.model.modes.kernels import KINDS
 from piezo_ident.model.modes.shared_modes import SharedModes
 import pytest
@@ -15,7 +15,7 @@ import pytest
 def test_sensitivities_agree_with_finite_differences():
     model = replace(stage.loop_stage(), creep=np.full((2, 1), 0.1), taus=np.array([80.0]))
     u = stage.multisine(np.random.default_rng(1), 1.2)[:400]
-    parameters = Parameters.of(model)
+    parameters = FreeNumbers.of(model)
     inner = output_sensitivities(model, parameters, model.run(u))
     outer = 2 * (model.linear.order + 2 + model.signals)
     step = 1e-6
@@ -34,7 +34,7 @@ def test_sensitivities_of_real_poles():
     blocks[0] = [[0.9, 0.0], [0.0, 0.3]]
     model = SharedModes.of(replace(linear, blocks=blocks))
     u = stage.multisine(np.random.default_rng(1), 1.0)[:200]
-    parameters = Parameters.of(model, hold=('b', 'e', 'f', 'g', 'mu'))
+    parameters = FreeNumbers.of(model, hold=('b', 'e', 'f', 'g', 'mu'))
     inner = output_sensitivities(model, parameters, model.run(u))
     for k in range(4):
         move = np.zeros(4 + 2 * 6)
