@@ -224,7 +224,7 @@ class _JointFits:
             if least < self._done:
                 goal = min(goal, FORM_RATIO * least + self._done)
             begin = partial(self._begin, Until(FIRST, goal=goal))
-            fits = [one for one in fit_starts(self._simulator, states, begin, self._alive) if one]
+            fits = [one for one in fit_states(self._simulator, states, begin, self._alive) if one]
             least = min([least, *map(_error, fits)])
             if fits:
                 found.append((min(fits, key=_error), min(fits[:STARTS], key=_error)))
@@ -278,7 +278,7 @@ class _JointFits:
         return fitted
 
 
-def fit_starts(
+def fit_states(
     simulator: Simulator,
     states: Sequence[State],
     fit: Callable[[Simulator, State, Callable[[], None]], Fitted],

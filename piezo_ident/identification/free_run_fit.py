@@ -22,12 +22,12 @@ from piezo_ident.fitting.stage import PARTS
 from piezo_ident.fitting.stretch import block_count, remembered, Stretch
 from piezo_ident.identification.free_run_result import FreeRunFits, outcome_of
 from piezo_ident.identification.free_run_starts import Allowed, Search, UNKNOWN
-from piezo_ident.identification.prepare import MOVES, REST, Run
+from piezo_ident.identification.prepare import MOVES, Run
 from piezo_ident.identification.results import FitOutcome
 from piezo_ident.identification.settings import Progress, Settings
 from piezo_ident.identification.spectra import HIGH_PASS, rms_above
 from piezo_ident.identification.step3_hysteresis import even_thresholds
-from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.scaling import REST, Scaling
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 from piezo_ident.record.readings.suspicions import rises_first
 from piezo_ident.selection.motion_kinds import interleaved, motion_kinds

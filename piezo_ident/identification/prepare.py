@@ -14,7 +14,7 @@ from piezo_ident.common.arrays import Array, closed, interpolated, Mask, true_ru
 from piezo_ident.common.errors import IdentificationError
 from piezo_ident.identification.refusals import refuse_closed_loop, refuse_undriven
 from piezo_ident.model.initial_memory import forgotten
-from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.scaling import REST, Scaling
 from piezo_ident.operators.hysteresis import Hysteresis
 from piezo_ident.operators.play import initial_memory
 from piezo_ident.record.readings.faults import without_faults
@@ -27,8 +27,6 @@ from piezo_ident.record.record import Piece, Record
 BLOCKS, EVERY = 60, 5
 #: share at the end of every noise and step segment that is not fitted
 END_HELD = 0.2
-#: a start has a known memory if its voltage is within this share of the range from the lowest
-REST = 0.01
 #: share of its range by which the voltage of a run must move
 MOVES = 0.02
 #: largest change of the voltage within one averaged row, as a share of its range

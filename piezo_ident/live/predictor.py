@@ -28,7 +28,7 @@ from piezo_ident.model.multi_axis import (
     MultiAxisModel,
     require_voltages_only,
 )
-from piezo_ident.model.scaling import Scaling
+from piezo_ident.model.scaling import REST, Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Stream
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -40,8 +40,6 @@ from piezo_ident.uncertainty.band import band_of, BandStream, KEY
 #: longest gap that a straight line bridges [s]; a longer gap starts a new run, because a stage
 #: ramps to rest after this default `silence`
 BRIDGE = 0.5
-#: share of the voltage range that counts as its lower end; a stage there has a known memory
-REST = 0.01
 #: default share of the errors that a band holds (taste)
 LEVEL = 0.9
 

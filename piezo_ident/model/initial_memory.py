@@ -43,6 +43,7 @@ from functools import cached_property
 import numpy as np
 from piezo_ident.common.arrays import Array, Mask
 from piezo_ident.effects.creep import Creep
+from piezo_ident.model.scaling import REST
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.model.stream import Start
 from piezo_ident.operators.dynamics import filter_arx
@@ -135,7 +136,7 @@ def forgetting(model: StageModel) -> float:
 
 def is_at_rest(model: StageModel, piece: Piece) -> bool:
     """Tell whether a piece starts near the lowest voltage, having come down to it."""
-    return abs(float(model.scaling.u(piece.v[0]))) < 0.01 and not rises_first(piece)
+    return abs(float(model.scaling.u(piece.v[0]))) < REST and not rises_first(piece)
 
 
 def unknown_starts(model: StageModel, record: Record) -> tuple[str, ...]:

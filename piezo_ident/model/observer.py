@@ -55,6 +55,7 @@ from piezo_ident.model import observer_kernel as kernel
 from piezo_ident.model.initial_memory import creep_elements
 from piezo_ident.model.memory_bounds import MemoryBounds
 from piezo_ident.model.metrics import expected_error
+from piezo_ident.model.scaling import REST
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.chain import Block, Chain
 from piezo_ident.operators.dynamics import DelayOperator, DynamicsOperator
@@ -94,8 +95,6 @@ BEYOND = 1.0 / np.sqrt(12.0)
 GATE = 5.0
 #: time of refused measurements after which they are believed [s] (taste)
 ACCEPT_AFTER = 5.0
-#: share of the range that counts as its lower end, where the memory is known
-REST = 0.01
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike
 from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 
+#: share of the range that counts as its lower end, where the memory of a stage is known
+REST = 0.01
+
 
 @dataclass(frozen=True)
 class Scaling:

@@ -15,7 +15,7 @@ from piezo_ident.diagnosis.equations import BaseColumns, FitStep, next_damping, 
 from piezo_ident.diagnosis.joint_fit import fit_base, fit_jointly, Until
 from piezo_ident.diagnosis.refits import base_thresholds
 from piezo_ident.diagnosis.rows import make_rows
-from piezo_ident.diagnosis.search import fit_starts
+from piezo_ident.diagnosis.search import fit_states
 from piezo_ident.diagnosis.simulator import Simulator
 from piezo_ident.diagnosis.state import Added, State
 from piezo_ident.effects import find_effect
@@ -105,7 +105,7 @@ def test_starts_are_fitted_each_by_itself_and_come_back_in_order():
             raise IdentificationError('singular')
         return number
 
-    found = fit_starts(simulator, STATES, fit, lambda: None)
+    found = fit_states(simulator, STATES, fit, lambda: None)
     assert [found[k] for k in (0, 2, 4)] == [0, 2, 4]
     # a fit that fails leaves the others alone
     assert found[1] is None and found[3] is None
@@ -128,7 +128,7 @@ def test_fits_side_by_side_can_be_cancelled():
         raise Cancelled('enough')
 
     with pytest.raises(Cancelled, match='enough'):
-        fit_starts(simulator, STATES, fit, tick)
+        fit_states(simulator, STATES, fit, tick)
     # all have ended by then
     assert len(ends) == len(simulator.copies(len(STATES)))
 

@@ -32,7 +32,7 @@ from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.axes.axes_inverse import AxesFilter, inverse_filters, static_gain
 from piezo_ident.control.expectation import expect
 from piezo_ident.control.inputs import check_rate, checked_limits, extrapolated, tolerance
-from piezo_ident.control.inverse import Inverse, LARGE, MATTERS, RESTS, STANDS, STILL
+from piezo_ident.control.inverse import EXACT, Inverse, LARGE, MATTERS, RESTS, STANDS, STILL
 from piezo_ident.control.linear_inverse import least_gain
 from piezo_ident.effects.slew_limit import SlewLimit
 from piezo_ident.model.metrics import percent, percent_of_stroke
@@ -45,8 +45,6 @@ from scipy.ndimage import maximum_filter1d
 
 #: most passes, and most passes in turn without a better one (taste)
 PASSES, STALLS = 40, 6
-#: rms error [of the span of the wanted motion] at which the iteration ends
-EXACT = 1e-5
 #: earlier passes that a step combines (taste: more find nothing in noise of 1e-6)
 DEPTH = 8
 #: smallest singular value of the changes from pass to pass that counts, over the largest (taste)

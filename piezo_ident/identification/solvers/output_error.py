@@ -22,11 +22,10 @@ from piezo_ident.common.arrays import Array
 from piezo_ident.common.errors import ModelError
 from piezo_ident.common.kernel import kernel
 from piezo_ident.fitting.damped import DampingSchedule, descend
+from piezo_ident.fitting.stage import RADIUS
 from piezo_ident.identification.prepare import Excerpt
 from piezo_ident.operators.dynamics import Dynamics, filter_arx
 
-#: poles beyond this radius, a decay of 100,000 samples, count as unstable
-RADIUS = 0.99999
 #: number of samples whose products are summed at once
 STRETCH = 1024
 #: damping of the steps, and the end of the refinement
