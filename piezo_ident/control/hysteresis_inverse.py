@@ -82,7 +82,7 @@ def _lags(u: float, lags: Array, z: Array, after: Array) -> tuple[float, float]:
 
     Equals `piezo_ident.operators.kernels.relaxing` for a single sample.
     """
-    w, slope, before, left, last = 0.0, 0.0, 0.0, 1.0, z[lags.shape[0]]
+    w, slope, before, left, last = 0.0, 0.0, 0.0, 1.0, float(z[lags.shape[0]])
     way = 1.0 if u > last else -1.0
     for j in range(lags.shape[0]):
         a, d1, d2, d3 = lags[j, 0], lags[j, 1], lags[j, 2], lags[j, 3]

@@ -177,7 +177,10 @@ def with_numerator(simulator: Simulator, step: FittedSet) -> FittedSet:
         if mode is None:
             continue
         for a in (model.dynamics.a, _poles_of(*mode, model.sample_rate)):
-            again = partial(tried, _with_other_numerator, simulator, a)
+
+            def again(state: State, a: Array = a) -> Fitted | None:
+                return tried(_with_other_numerator, simulator, a, state)
+
             last = replace(step, fitted=polished(again, step.fitted))
             best = min(best, last, key=lambda one: one.fitted.mean_square)
     return best
