@@ -52,7 +52,7 @@ def test_a_second_job_is_refused_and_the_first_cancelled(listener):
     with pytest.raises(PiezoIdentError, match='~/cancel'):
         listener.start(priority)
     listener.worker.cancel()
-    assert listener.worker.join(10.0) and not listener.worker.is_busy
+    assert listener.worker.join(60.0) and not listener.worker.is_busy
     ((result, error),) = listener.results
     assert result is None and isinstance(error, Cancelled)
     # the next job is not cancelled by the same call
