@@ -28,8 +28,9 @@ from piezo_ident.verbs.learn_motion import AxesLearning
 
 #: wait at the first voltage before a repetition begins [s]
 SETTLE = 0.05
-#: longest wait for the next displacement after a repetition was sent in full [s]
-PATIENCE = 2.0
+#: longest wait for the next displacement after a repetition was sent in full [s].  The middleware
+#: sends a lost block again after up to 3 s.
+PATIENCE = 5.0
 
 
 class LiveLearning:

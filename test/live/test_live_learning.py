@@ -8,10 +8,14 @@ from dataclasses import replace
 from effect_table import VISIBLE
 import numpy as np
 from paper_stage import FS, PAPER
+from piezo_ident.common.errors import ConfigError
+from piezo_ident.live import live_learning
 from piezo_ident.live.guard import Guard, GuardSettings
-from piezo_ident.live.live_learning import LiveLearning
+from piezo_ident.live.live_learning import Learner, LiveLearning
+from piezo_ident.live.tracker import Tracker
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.record.blocks import Samples
+import pytest
 
 SETTINGS = GuardSettings(0.0, 10.0, 40e3, 200.0, 0.0, FS)
 
@@ -40,3 +44,29 @@ def test_it_learns_from_blocks_of_any_clock_and_knows_when_they_are_complete():
         assert not learning.is_complete
     assert len(learning.errors) == 3
     assert learning.errors[2] < 0.1 * learning.errors[0]
+
+
+@pytest.mark.parametrize(('late', 'comes'), [(3.5, True), (5.5, False)])
+def test_a_lost_block_is_waited_for_until_it_is_sent_again(monkeypatch, late, comes):
+    clock, sent = [100.0], []
+    monkeypatch.setattr(live_learning.time, 'monotonic', lambda: clock[0])
+    learning = LiveLearning(PAPER, np.full((1, 200), 20e-6), SETTINGS)
+    learner = Learner(lambda: learning, 1, lambda voltage, _: sent.append(voltage))
+    learner._thread.join()
+    tracker = Tracker(PAPER, SETTINGS)
+    while not learner.is_played:
+        learner.step(tracker)
+        clock[0] += 0.1
+    tracker.idle(round(FS))
+    *answers, last = [Samples(b.t, np.zeros(b.t.size), b.segment) for b in sent]
+    for answer in answers:
+        learner.measured(answer)
+    clock[0] += late
+    if comes:
+        learner.step(tracker)
+        learner.measured(last)
+        learner.step(tracker)
+        assert learner.progress == 100.0
+    else:
+        with pytest.raises(ConfigError, match='of repetition 1 did not come in full'):
+            learner.step(tracker)
