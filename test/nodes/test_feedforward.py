@@ -112,32 +112,35 @@ def started(g):
     is_in(g, 'ready')
 
 
-def test_without_a_model_it_does_not_start(lab):
-    ok, said = lab.call('feedforward/start')
-    assert not ok and 'there is no model' in said
-    lab.publish_text('model', paper(hysteresis=FALLS))
-    lab.wait(lambda: 'slope falls to' in lab.status('feedforward')['text'], 'the refusal')
-    said = lab.status('feedforward')['text']
-    assert re.search(r'topic model: .* slope falls to -0\.9 at 10 V', said), said
-    assert lab.call('feedforward/stop') == (False, 'the node does not drive')
+def test_without_a_model_it_does_not_start():
+    with Graph() as g:
+        g.start('feedforward')
+        ok, said = g.call('feedforward/start')
+        assert not ok and 'there is no model' in said
+        g.publish_text('model', paper(hysteresis=FALLS))
+        g.wait(lambda: 'slope falls to' in g.status('feedforward')['text'], 'the refusal')
+        said = g.status('feedforward')['text']
+        assert re.search(r'topic model: .* slope falls to -0\.9 at 10 V', said), said
+        assert g.call('feedforward/stop') == (False, 'the node does not drive')
 
 
 def test_the_stage_goes_where_it_is_told(lab):
+    topics = ('voltage', 'tracking_error', 'displacement')
+    voltage, errors, answers = (lab.collect(topic) for topic in topics)
     armed(lab)
-    voltage, errors = lab.collect('voltage'), lab.collect('tracking_error')
-    assert not voltage
+    first, since, begin = (len(blocks) for blocks in (voltage, errors, answers))
     x = reference()
     sent(lab, x)
     over(lab)
-    t, v = column(voltage)
+    t, v = column(voltage[first:])
     assert t.tobytes() == (np.arange(t.size) / FS).tobytes()
     assert v[0] == 0.0 == v[-1]
-    assert list(dict.fromkeys(b.segment for b in voltage)) == ['scan', 'ramp:stop']
+    assert list(dict.fromkeys(b.segment for b in voltage[first:])) == ['scan', 'ramp:stop']
     # what the stage measured, where the node said
-    lab.wait(lambda: samples(errors) >= x.size + 400, 'the errors')
+    lab.wait(lambda: samples(errors[since:]) >= x.size + 400, 'the errors')
     told = len(lab.diagnoses('feedforward'))
-    t, e = column(errors)
-    ty, y = column(lab.collect('displacement'))
+    t, e = column(errors[since:])
+    ty, y = column(answers[begin:])
     assert t.tobytes() == ty[: t.size].tobytes()
     np.testing.assert_allclose((e + y[: t.size])[-x.size // 2 :], x[-x.size // 2 :], atol=1e-12)
     # converters of 16 bit, noise of 1.5 nm
