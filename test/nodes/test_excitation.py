@@ -201,7 +201,8 @@ def test_stop_ramps_to_rest_and_goes_on_with_t(lab):
     assert lab.set('excitation', 'program', HIGH) == (True, '')
     # the test is not what keeps a busy machine from answering
     assert lab.set('excitation', 'block_size', 1000)[0]
-    for rest, slew in ((0.0, 20.0), (1.0, 40.0)):
+    # the stage ends where other programs begin
+    for rest, slew in ((1.0, 40.0), (0.0, 20.0)):
         assert lab.set('excitation', 'rest', rest) == (True, '')
         assert lab.set('excitation', 'ramp_slew', slew) == (True, '')
         blocks = stopped(lab, rest)
