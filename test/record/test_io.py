@@ -80,7 +80,6 @@ def assert_equal(a: Record, b: Record) -> None:
 
 
 @settings(
-    # one .mat costs a process
     max_examples=5,
     deadline=None,
     # shrinking files takes minutes and finds nothing that the message does not say
