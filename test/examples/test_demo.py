@@ -4,12 +4,14 @@
 """The demo without nodes: the page, and what it leads to; and what make installs for it."""
 
 from dataclasses import replace
+import functools
 import html
 import importlib
 import json
 import os
 from pathlib import Path
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -19,57 +21,53 @@ import piezo_ident as pi
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-#: runs a script as if rclpy were not installed, with shorter motions; it tries the effects of the
-#: stage alone, few orders and few thresholds, and renders no picture
-BLOCKED = """
-from dataclasses import replace
-import functools, runpy, sys
-sys.modules['rclpy'] = None
-del sys.argv[0]
-sys.path.insert(0, 'examples')
-import piezo_ident as pi
-from piezo_ident.report.figures import style
-style.png = lambda *_: bytes(33)
-few = pi.DiagnosisSettings(effects=('creep', 'rate_dependent_hysteresis'))
-pi.diagnose = functools.partial(pi.diagnose, settings=few)
-pi.identify = functools.partial(pi.identify, settings=pi.Settings(max_order=8, thresholds=12))
+#: what becomes of times, periods and slopes of the programs
+LESS = {'duration': lambda x: 0.4 * x, 'periods': lambda x: 1, 'slope': lambda x: 2.5 * x}
 
-def load(name, load=pi.Program.load):
-    program = load(name)
-    less = {'duration': lambda x: 0.4 * x, 'periods': lambda x: 1}
-    entries = (
-        replace(e, options={k: less[k](x) if k in less and x else x for k, x in e.options.items()})
-        for e in program.entries
-    )
-    return replace(program, entries=tuple(entries))
 
-pi.Program.load = load
-runpy.run_path(sys.argv[0], run_name='__main__')
-"""
+@pytest.fixture
+def short_demo(monkeypatch, blank_pictures):
+    """Have the demo without rclpy try few effects, orders and thresholds on shorter motions."""
+
+    def load_less(name, load=pi.Program.load):
+        program = load(name)
+        entries = (
+            replace(e, options={k: LESS[k](x) if k in LESS and x else x for k, x in options})
+            for e in program.entries
+            for options in [e.options.items()]
+        )
+        return replace(program, entries=tuple(entries))
+
+    few = pi.DiagnosisSettings(effects=('creep', 'rate_dependent_hysteresis'))
+    monkeypatch.setattr(pi, 'diagnose', functools.partial(pi.diagnose, settings=few))
+    quick = functools.partial(pi.identify, settings=pi.Settings(max_order=8, thresholds=12))
+    monkeypatch.setattr(pi, 'identify', quick)
+    monkeypatch.setattr(pi.Program, 'load', load_less)
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    monkeypatch.syspath_prepend(str(ROOT / 'examples'))
 
 
 @pytest.mark.slow
-def test_the_demo_finds_what_is_hidden_and_its_page_leads_to_the_rest(tmp_path):
+@pytest.mark.filterwarnings('error::UserWarning', 'error::RuntimeWarning')
+def test_the_demo_finds_what_is_hidden_and_its_page_leads_to_the_rest(
+    short_demo, tmp_path, monkeypatch, capsys
+):
     out = tmp_path / 'out'
-    done = subprocess.run(
-        [sys.executable, '-c', BLOCKED, 'examples/demo.py', '--out', str(out)],
-        cwd=ROOT,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
+    monkeypatch.setattr(sys, 'argv', ['demo.py', '--out', str(out)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / 'examples/demo.py'), run_name='__main__')
+    done = capsys.readouterr()
     # numba compiles where its cache is cold
-    said = [line for line in done.stderr.splitlines() if not line.startswith('compiling the')]
-    assert (done.returncode, said) == (0, [])
+    said = [line for line in done.err.splitlines() if not line.startswith('compiling the')]
+    assert (ended.value.code, said) == (0, [])
     # one line says what is missing
-    assert 'the nodes cannot run here' in done.stdout.splitlines()[0]
+    assert 'the nodes cannot run here' in done.out.splitlines()[0]
     before, after = (
-        float(re.search(rf'^{word}: +(\d+) nm', done.stdout, re.M)[1])
-        for word in ('before', 'after')
+        float(re.search(rf'^{word}: +(\d+) nm', done.out, re.M)[1]) for word in ('before', 'after')
     )
     assert after < 0.3 * before
     # mean included
-    estimate = re.search(r'^estimate after: \d+ nm \(([\d.]+) % of stroke', done.stdout, re.M)
+    estimate = re.search(r'^estimate after: \d+ nm \(([\d.]+) % of stroke', done.out, re.M)
     assert float(estimate[1]) <= 0.02
     diagnosis = json.loads((out / 'reports' / 'diagnosis' / 'diagnosis.json').read_text())
     assert 'creep' in [effect['name'] for effect in diagnosis['effects']]
