@@ -30,6 +30,7 @@ from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.many.run import MARK
 from piezo_ident.model.files import load
 from piezo_ident.record.record import Piece, Record
+from piezo_ident.report.figures import style
 import pytest
 
 FAST = ['--order', '2,2', '--thresholds', '5', '--solver', 'least_squares']
@@ -55,23 +56,24 @@ def test_version_and_help(capsys):
     assert all(verb in text for verb in cli.commands)
 
 
-@pytest.mark.parametrize(
-    ('verb', 'spared'),
-    [
-        # before the arguments are known
-        ('', ('numpy', 'scipy', 'numba', 'matplotlib')),
-        ('effects', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'rosbags', 'matplotlib')),
-        ('model', ('scipy.signal', 'scipy.stats', 'matplotlib', 'jinja2')),
-        ('record', ('scipy.optimize', 'scipy.signal', 'scipy.stats', 'matplotlib')),
-    ],
+#: imports, one after the other in one process, and what none of them up to there may import
+IMPORTS = (
+    ('from piezo_ident.cli import main; main(["--version"])', 'numpy scipy numba rosbags jinja2'),
+    ('import piezo_ident.cli.effects_command', 'scipy.optimize rosbags jinja2'),
+    ('import piezo_ident.cli.record_command', 'scipy.optimize jinja2'),
+    ('import piezo_ident.cli.model_command', 'scipy.signal scipy.stats jinja2 matplotlib'),
+    ('import piezo_ident.report', 'jinja2 matplotlib'),
+    ('import piezo_ident.report.figures.diagnosis', 'matplotlib.pyplot'),
 )
-def test_a_verb_imports_only_what_it_needs(verb, spared):
-    work = f'import piezo_ident.cli.{verb}_command'
-    if not verb:
-        work = 'from piezo_ident.cli import main; main(["--version"])'
-    code = f'{work}; import sys; print([m for m in {spared!r} if m in sys.modules])'
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert done.stdout.removeprefix(f'piezo_ident {__version__}\n') == '[]\n'
+
+
+def test_only_what_is_needed_is_imported():
+    lines = ['import sys']
+    for work, spared in IMPORTS:
+        lines += [work, f'print([m for m in {spared.split()} if m in sys.modules])']
+    command = [sys.executable, '-c', '\n'.join(lines)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [f'piezo_ident {__version__}', *['[]'] * len(IMPORTS)]
 
 
 def test_notices_are_for_terminals(capsys, monkeypatch):
@@ -81,15 +83,6 @@ def test_notices_are_for_terminals(capsys, monkeypatch):
         with Console().notices():
             log.warning('compiling')
         assert capsys.readouterr() == ('', said)
-
-
-def test_the_module_runs_as_a_program():
-    done = subprocess.run(
-        [sys.executable, '-m', 'piezo_ident', 'simulate', 'no.xyz'], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr.startswith('piezo_ident: error: no.xyz')
-    assert done.stderr.count('\n') == 1
 
 
 def test_simulate_is_repeatable_and_its_seed_counts(capsys, tmp_path, made):
@@ -450,37 +443,28 @@ def test_interrupt_leaves_nothing(capsys, tmp_path):
     assert list(tmp_path.iterdir()) == [record]
 
 
-def interrupt_while(
-    module: str, function: str, argv: list[object], before: str = ''
-) -> tuple[int, str, str]:
-    """Run a command that gets a SIGINT when it calls a function, before the function works."""
-    code = (
-        f'{before}\n'
-        'import os, signal, sys, time\n'
-        f'import {module} as module\n'
-        f'def striking(*args, work=module.{function}, **more):\n'
-        '    os.kill(os.getpid(), signal.SIGINT); time.sleep(0.01)\n'
-        '    return work(*args, **more)\n'
-        f'module.{function} = striking\n'
-        f"sys.argv = ['piezo_ident', *{[str(a) for a in argv]!r}]\n"
-        'from piezo_ident.cli import main\n'
-        'sys.exit(main())\n'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code],
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    return done.returncode, done.stdout, done.stderr
+@pytest.fixture
+def interrupted(capsys, monkeypatch):
+    """Return what runs a command that gets a SIGINT each time a function begins to work."""
+
+    def run_it(owner, function: str, argv: list[object]) -> tuple[int, str, str]:
+        work = getattr(owner, function)
+
+        def striking(*args, **more):
+            signal.raise_signal(signal.SIGINT)
+            return work(*args, **more)
+
+        monkeypatch.setattr(owner, function, striking)
+        return run(capsys, *argv)
+
+    return run_it
 
 
-def test_interrupt_while_outputs_are_put_in_place(tmp_path, made):
+def test_interrupt_while_outputs_are_put_in_place(tmp_path, made, interrupted):
     # the report and the model are whole, whichever file was at work
     argv = ['identify', made / 'record.npz', '--model', tmp_path / 'm.yaml', *FAST]
     argv += ['--report', tmp_path / 'report']
-    blank = 'from piezo_ident.report.figures import style; style.png = lambda *_: bytes(33)'
-    code, out, err = interrupt_while('os', 'fsync', argv, blank)
+    code, out, err = interrupted(os, 'fsync', argv)
     assert (code, out, err.count('\n')) == (130, '', 1)
     assert sorted(p.name for p in tmp_path.iterdir()) == ['m.yaml', 'report']
     names = {p.name for p in (tmp_path / 'report').iterdir()}
@@ -488,9 +472,9 @@ def test_interrupt_while_outputs_are_put_in_place(tmp_path, made):
     assert load(tmp_path / 'm.yaml').delay.samples == 2
 
 
-def test_interrupt_while_pictures_are_drawn(tmp_path, made):
+def test_interrupt_while_pictures_are_drawn(tmp_path, made, interrupted):
     argv = ['identify', made / 'record.npz', '--report', tmp_path / 'report', *FAST]
-    code, out, err = interrupt_while('matplotlib.figure', 'Figure.savefig', argv)
+    code, out, err = interrupted(style, 'png', argv)
     assert (code, out, err.count('\n')) == (130, '', 1)
     assert list(tmp_path.rglob('*.png')) == []
 
