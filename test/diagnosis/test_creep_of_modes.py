@@ -29,7 +29,7 @@ def record(truth, seed):
     """Return multisines of three amplitudes, and voltages that hold for 0.5 s."""
     rng, parts, labels = np.random.default_rng(seed), [], []
     for amplitude in (0.5, 1.0, 1.5):
-        for i in range(3):
+        for i in range(2):
             parts.append(np.tile(stage.multisine(rng, amplitude), (3, 1)))
             labels.append(f'multisine:{amplitude:g}-{i}')
     parts.append(np.repeat(rng.uniform(-2.5, 2.5, (HOLDS, 2)), HOLD, axis=0))
