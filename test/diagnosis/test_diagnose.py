@@ -308,7 +308,7 @@ def test_an_axis_that_does_not_move_by_itself_tests_no_coupling(moves):
         # a large drift bends a wide H, beside which creep fits better at first
         ('thermal_drift', 1.0, 1, 'creep', EVERY),
         # beside a wide H ends of the range look like a bent sensor, until saturation is tried
-        ('saturation', 0.3, 2, 'sensor_nonlinearity', 3),
+        ('saturation', 0.3, 2, 'sensor_nonlinearity', 5),
     ],
 )
 def test_what_looks_like_another_effect_at_first_stands_alone(effect, size, seed, other, every):
