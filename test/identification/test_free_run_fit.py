@@ -101,7 +101,7 @@ def test_a_given_delay_is_taken_and_too_little_is_refused():
 
 def test_steps_alone_do_not_identify_hysteresis():
     stage = SimulatedStage.load('paper')
-    text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.05, count: 8}'
+    text = 'limits: [0, 10]\nsegments:\n  - {signal: step, bias: 5, size: 4, hold: 0.05, count: 4}'
     played = stage.play(parse_program(text).build(20000.0), np.random.default_rng(1))
     steps = played.find('step')[0]
     record = Record((Piece(steps.v, steps.y, steps.sample_rate),), 'steps')
@@ -225,7 +225,7 @@ def slow_record(delay, n=800):
 
 @pytest.mark.parametrize('delay', [0, 7])
 def test_a_given_delay_is_used_and_labelled_even_where_another_errs_less(delay):
-    result = identify(slow_record(3), Settings(delay=delay, thresholds=6))
+    result = identify(slow_record(3), Settings(delay=delay, thresholds=6, max_order=4))
     assert (result.delay.samples, result.delay.source) == (delay, 'given')
     assert result.model.delay.total == delay
     assert 'delay' not in dict(result.not_identified)

@@ -453,7 +453,7 @@ def ramp_for_noise(rise):
 
 AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
     'only triangle': lambda: part('triangle', record=decimated(short(), 4)),
-    'only noise': lambda: part('noise'),
+    'only noise': lambda: part('noise', record=decimated(short(), 4)),
     'only steps': lambda: part('step', record=decimated(short(), 4)),
     'noise without triangle': lambda: part('idle', 'step', 'settle', 'noise'),
     'unlabelled': lambda: relabelled(decimated(short(), 8)),
@@ -487,7 +487,7 @@ AWKWARD: dict[str, Callable[[], Record | list[Record]]] = {
     'one jump': lambda: Record(
         (Piece(np.arange(2000) // 1000, 1e-6 * (np.arange(2000) // 1000), 1e3),)
     ),
-    'noise unlabelled': lambda: relabelled(decimated(part('noise'), 2)),
+    'noise unlabelled': lambda: relabelled(decimated(part('noise'), 4)),
 }
 
 
