@@ -52,6 +52,7 @@ diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 EVERY = 10
 RATE = TRUTH_RATE / EVERY
 ONLY_CREEP = DiagnosisSettings(effects=('creep',))
+ONLY_HUM = DiagnosisSettings(effects=('periodic_disturbance',))
 
 
 def record_of(v, y, segments, name, channels=None, rate=RATE) -> Record:
@@ -475,8 +476,7 @@ def test_a_refit_of_h_is_kept_beside_hum():
     h = model.hysteresis
     other = replace(h, thresholds=h.thresholds**0.7, weights=1.1 * h.weights)
     off = replace(model, hysteresis=other)
-    few = DiagnosisSettings(effects=('periodic_disturbance',))
-    result = diagnose(off, record, few)
+    result = diagnose(off, record, ONLY_HUM)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert not any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     before, after = unseen_errors(result, unseen)
@@ -486,7 +486,7 @@ def test_a_refit_of_h_is_kept_beside_hum():
 
 def test_hum_stays_in_its_record():
     *_, unseen = measured('periodic_disturbance', 0.3, 1, every=1)
-    result = diagnosed('periodic_disturbance', 0.3, 1, FEW, every=1)
+    result = diagnosed('periodic_disturbance', 0.3, 1, ONLY_HUM, every=1)
     assert any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3
