@@ -134,6 +134,7 @@ def test_what_set_in_since_is_found_beside_hum():
 
 def test_the_verdict_on_a_measured_stage_is_one_for_all_parts_of_it():
     (piece,) = measured_record('piezo_1hz.csv').pieces
+    piece = Piece(piece.v[::2], piece.y[::2], 0.5 * piece.sample_rate)
     third = piece.n // 3
     pairs = [Record((piece.cut(i * third, (i + 2) * third),), f'from {i}') for i in range(2)]
     model = identify(pairs[0]).model
