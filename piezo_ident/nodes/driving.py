@@ -110,9 +110,8 @@ class DrivingNode(LabNode):
     def _send(self, t: NDArray[np.float64], v: NDArray[np.float64], segment: str) -> None:
         for k in range(0, t.size, BLOCK_SIZE * 10):
             cut = slice(k, k + BLOCK_SIZE * 10)
-            for tail, output, row in zip(
-                self._tails, self._outputs, np.atleast_2d(v), strict=True
-            ):
+            rows = reversed([*zip(self._tails, self._outputs, np.atleast_2d(v), strict=True)])
+            for tail, output, row in rows:
                 output.send(Samples(t[cut], row[cut], segment, f'voltage{tail}'))
         self._counts['samples'] += t.size
 

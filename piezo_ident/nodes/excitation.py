@@ -262,8 +262,7 @@ class ExcitationNode(LabNode):
             playing.second = self._second or playing.second
             percent = math.floor(100.0 * stop / sequence.n)
             text = f'{_name(sequence)}, segment {label}{warning}'
-            brief = f'{percent} %: {text}'
-            more = {'brief': brief, 'problems': self._second, 'segment': label}
+            more = {'brief': f'{percent} %: {text}', 'problems': self._second, 'segment': label}
             self.report_status('running', percent, text, level, **more)
         # a stop during the last block
         self._sleep(playing, time.monotonic())
@@ -277,7 +276,9 @@ class ExcitationNode(LabNode):
         t = np.arange(playing.tick, playing.tick + n) / playing.sequence.sample_rate
         playing.tick += n
         playing.voltages, playing.segment = [float(v[-1]) for v in voltages], label
-        for tail, output, v in zip(self._tails, self._outputs, voltages, strict=True):
+        # the first axis last: readers wait but a moment for the others, and for the first any time
+        rows = reversed([*zip(self._tails, self._outputs, voltages, strict=True)])
+        for tail, output, v in rows:
             output.send(Samples(t, v * self._scale, label, f'{self._quantity}{tail}'))
         playing.work = time.perf_counter() - begin
 

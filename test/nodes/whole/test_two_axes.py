@@ -4,6 +4,7 @@
 """A stage of two axes on the graph: driven, recorded, identified by a service call."""
 
 from dataclasses import replace
+from functools import partial
 import json
 
 from course import column
@@ -13,10 +14,12 @@ import piezo_ident as pi
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.modes.modal import Modal
 from piezo_ident.model.modes.shared_modes import SharedModes
-from piezo_ident.record.blocks import Samples
+from piezo_ident.nodes.wire import STREAM
+from piezo_ident.record.blocks import cut_blocks, Samples
 from programs import identification_program
 import pytest
 from random_models import brittle_modes, random_shared_modes
+from std_msgs.msg import Float64MultiArray
 
 RATE = 2000.0
 #: what every axis plays alone
@@ -153,6 +156,30 @@ def test_the_live_prediction_is_the_free_run(lab, identified, shares_modes):
         assert lab.call('model/save')[0]
         assert pi.load(learnt).modes is not None
         assert lab.set('model', 'adapt', 'off')[0]
+
+
+def test_the_block_of_the_first_axis_is_sent_last(lab):
+    # its readers wait a moment for the others: not where the sender gets no time between the two
+    sent = {'voltage': {}, 'voltage_b': {}}
+
+    def keep(topic, message, info):
+        sent[topic][message.data[0]] = info['source_timestamp']
+
+    heard = [
+        lab.node.create_subscription(Float64MultiArray, topic, partial(keep, topic), STREAM)
+        for topic in sent
+    ]
+    for topic in sent:
+        lab.matched(topic)
+    lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
+    assert lab.finish('excitation/start')['state'] == 'done'
+    played = parse_program(BOTH).build(RATE)
+    blocks = len([*cut_blocks(played.n, played.segments, 100)])
+    lab.wait(lambda: all(len(times) == blocks for times in sent.values()), 'all blocks')
+    for one in heard:
+        lab.forget(one)
+    first, second = sent.values()
+    assert all(second[t] < first[t] for t in first)
 
 
 def test_a_model_of_other_axes_is_refused(lab, identified):
