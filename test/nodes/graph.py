@@ -234,6 +234,8 @@ class Graph(Observer):
         path.write_text(text)
         client = AsyncParameterClient(self.node, f'/{node}')
         self.wait(client.services_are_ready, f'the parameters of {node}')
+        # a server drops the answer to one of whom it does not know
+        self._known_to(node)
         future = client.load_parameter_file(str(path))
         self.wait(future.done, 'the answer')
         results = zip(values, future.result().results, strict=True)
