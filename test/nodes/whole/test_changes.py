@@ -20,8 +20,11 @@ TEXT = paper(
 )
 MODEL = model_of(TEXT)
 H, G = MODEL.hysteresis, MODEL.dynamics
-#: samples of a block, and before the stage changes; blocks under way at once
-SIZE, AT, AHEAD = 1000, 20_000, 20
+#: samples of a block, and before the stage changes
+SIZE, AT = 1000, 20_000
+#: blocks of each topic under way at once: less than the half second after which the estimate goes
+#: on without displacement, and no more than the middleware keeps for a node that gets no time
+AHEAD = 5
 
 
 def with_modes(factor):
