@@ -17,6 +17,8 @@ import pytest
 
 #: blocks under way at once; more of this size do not fit into the middleware's shared memory
 AHEAD = 10
+#: a silence that no test reaches [s]
+PATIENT = 600.0
 
 
 def captured(g: Graph, name: str = 'identifier') -> dict[str, float]:
@@ -45,7 +47,9 @@ class Rig:
         self.applied = g.collect('applied_voltage')
         self.prediction = g.collect('prediction')
         self.models, self.reports = g.texts('model'), g.texts('report')
-        g.start_all(('stage', {'seed': 3}), ('identifier', QUICK), ('model',))
+        # also where it is started once more
+        stage = {'seed': 3, 'silence': PATIENT}
+        g.start_all(('stage', stage), ('identifier', QUICK), ('model',))
         self.rest(clear=False)
         self.meet()
 
@@ -94,7 +98,7 @@ class Rig:
         # the end of the ramp belongs to what was before
         g.wait(lambda: not self.applied or abs(self.applied[-1].values[-1]) < 1e-9, '0 V')
         # from here on a test may take its time
-        assert g.set('stage', 'silence', 600.0)[0]
+        assert g.set('stage', 'silence', PATIENT)[0]
         if clear:
             assert g.call('identifier/clear')[0]
         self.sent = []
