@@ -87,10 +87,12 @@ def test_what_a_killed_driver_left_on_the_card_is_ramped_to_rest(tmp_path):
     driver.write_text(text.replace('return rest  #', 'return 1.5  #'), encoding='utf-8')
     with Graph() as g:
         applied = g.collect('applied_voltage')
-        command = [sys.executable, str(driver), '--ros-args', '-p', 'silence:=2.0']
+        # until the test listens
+        command = [sys.executable, str(driver), '--ros-args', '-p', 'silence:=600.0']
         g.follow('stage', 'stage')
         g.handles.append(Handle(g, 'stage', command, g.folder / 'driver.log'))
         g.matched('applied_voltage')
+        assert g.set('stage', 'silence', 0.05)[0]
         g.wait(lambda: at_rest(g), 'rest')
         v = column(applied)
         assert v.max() <= 1.5
@@ -140,8 +142,9 @@ def test_silence_and_what_comes_after_it(lab, begin):
     applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
     # up by a ramp, too high, and then nothing more
     send(lab, [9.0] * 60 + [11.0] * 20)
+    seen = len(lab.statuses('stage'))
     assert lab.set('stage', 'silence', 0.05)[0]
-    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'silence')
+    lab.until('stage', 'ramping', since=seen)
     lab.wait(lambda: at_rest(lab), 'rest')
     new = applied[begin['applied_voltage'] :]
     v = column(new)
