@@ -67,7 +67,6 @@ IDENTIFIER = {
     'program': LEARN,
     'sweeps_program': SWEEPS,
     'holds_program': HOLDS,
-    'excitation_limit': 5.0,
     'nice': 0,
 }
 #: a diagnosis on a machine that does other things [s]
@@ -85,7 +84,8 @@ def lab(tmp_path_factory):
     excitation = {'sample_rate': FS, 'rate_factor': 4.0, 'program': LEARN, 'subscribers': 3}
     with Graph() as g:
         g.start_all(
-            ('stage', {'stage': str(path), 'seed': 3}),
+            # longer than a busy machine keeps a program from its next block
+            ('stage', {'stage': str(path), 'seed': 3, 'silence': 5.0}),
             ('excitation', excitation),
             ('identifier', IDENTIFIER),
             ('model',),
@@ -187,7 +187,11 @@ def test_save_writes_both_reports(lab, story, tmp_path):
 def test_cancel_stops_the_work_and_changes_nothing(lab, story):
     models, reports = len(lab.texts('model')), len(lab.texts('report'))
     seen = begin(lab, 'diagnose')
-    lab.wait(lambda: lab.status('identifier')['text'] == 'candidates', 'the candidates')
+    lab.wait(
+        lambda: any(s['text'] == 'candidates' for s in lab.statuses('identifier')[seen:]),
+        'the candidates',
+        LONG,
+    )
     ok, reason = lab.call('identifier/diagnose')
     assert not ok and 'busy: diagnosis' in reason
     assert lab.call('identifier/cancel')[0]
@@ -199,8 +203,14 @@ def test_cancel_stops_the_work_and_changes_nothing(lab, story):
 def test_cancel_ramps_what_was_asked_for_to_rest(lab, story):
     assert lab.call('identifier/clear')[0]
     assert lab.set('excitation', 'rate_factor', 1.0) == (True, '')
+    seen = len(lab.statuses('excitation'))
     begin(lab, 'diagnose')
-    lab.wait(lambda: lab.status('excitation').get('segment') == 'sine:1Hz-first', 'the sine')
+    lab.wait(
+        lambda: any(
+            s.get('segment') == 'sine:1Hz-first' for s in lab.statuses('excitation')[seen:]
+        ),
+        'the sine',
+    )
     assert lab.call('identifier/cancel')[0]
     lab.wait(lambda: lab.status('identifier')['state'] == 'cancelled', 'cancelled')
     lab.wait(lambda: lab.status('excitation')['state'] == 'stopped', 'stopped')

@@ -29,7 +29,8 @@ def driven(course):
 @pytest.fixture(scope='module')
 def measured(driven):
     """Return the graph with an excitation and a stage."""
-    driven.start('stage', {'seed': 3})
+    # longer than a busy machine keeps a program from its next block
+    driven.start('stage', {'seed': 3, 'silence': 5.0})
     assert driven.set('identifier', 'excitation_limit', 20.0)[0]
     return driven
 
