@@ -231,11 +231,11 @@ def test_both_axes_follow_their_references(lab, identified, shares_modes):
     lab.until('feedforward', 'done', since=seen)
     told = lab.status('feedforward')['text']
     assert 'refused' not in told and 'missing' not in told, told
+    lab.wait(lambda: all(blocks[-1].values[-1] == 0.0 for blocks in sent), 'rest')
     first, second = (
         np.concatenate([block.values for block in blocks[start:]])
         for blocks, start in zip(sent, begin, strict=True)
     )
-    assert first[-1] == second[-1] == 0.0
     for v in (first, second):
         assert 2.0 < np.ptp(v) and v.min() >= 0.0 and v.max() <= 10.0
         assert np.abs(np.diff(v)).max() * RATE <= 1000.0 * (1 + 1e-9)
@@ -294,6 +294,15 @@ def test_a_stop_ramps_both_axes(lab):
 
 def test_an_axis_that_nobody_drives_rests(lab):
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'a stage at rest')
+    # all blocks are of one stream, however long the test takes between them
+    assert lab.set('stage', 'silence', 600.0)[0]
+    try:
+        drive_alone(lab)
+    finally:
+        assert lab.set('stage', 'silence', 2.0)[0]
+
+
+def drive_alone(lab):
     moved = [lab.collect(topic) for topic in ('displacement', 'displacement_b')]
     applied = lab.collect('applied_voltage_b')
     seen = len(moved[0]), len(applied)
