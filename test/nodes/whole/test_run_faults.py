@@ -10,6 +10,7 @@ from course import column, FS, HIGH, model_of, PROGRAM, QUICK, simulated
 from graph import ENDS, Graph
 import numpy as np
 from piezo_ident.record.bags.write import write_bag
+from processes import WORK
 import pytest
 
 RESTING = ('idle', 'done', 'failed', 'cancelled', 'stopped', '')
@@ -22,7 +23,8 @@ def graph():
         g.texts('model')
         g.start_all(
             ('excitation', {'block_size': 500, 'subscribers': 2}),
-            ('stage', {'seed': 3}),
+            # longer than a busy machine keeps a program from its next block
+            ('stage', {'seed': 3, 'silence': 2.0}),
             ('identifier', QUICK),
         )
         g.matched('applied_voltage')
@@ -51,7 +53,7 @@ def run(g: Graph, program: str) -> int:
 
 def ended(g: Graph, seen: int, state: str) -> str:
     """Wait for the end of a run, and return its message."""
-    end = g.until('identifier', *ENDS, since=seen)
+    end = g.until('identifier', *ENDS, since=seen, timeout=WORK)
     assert end['state'] == state, end
     return end['text']
 
@@ -81,8 +83,7 @@ def test_two_excitations_on_one_topic(lab):
         'the twin to know that it is not alone',
     )
     assert lab.call('twin/start')[0]
-    lab.wait(lambda: lab.status('other/twin')['state'] == 'failed', 'the twin to give up')
-    said = lab.status('other/twin')['text']
+    said = lab.until('other/twin', 'failed')['text']
     assert 'another /excitation drives /voltage now' in said
     assert twin.stop() == 0
     other = lab.start('excitation', {'program': HIGH}, remaps={'__node': 'other'})
@@ -102,17 +103,17 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
     applied, models = lab.collect('applied_voltage'), len(lab.texts('model'))
     seen = run(lab, HIGH)
     at_nine_volts(lab)
-    killed, end = lab.handle('excitation'), len(applied)
+    killed, end, told = lab.handle('excitation'), len(applied), len(lab.statuses('stage'))
     killed.kill()
-    lab.wait(lambda: lab.status('stage')['state'] == 'ramping', 'the ramp')
-    assert lab.status('stage')['level'] == '1'
-    assert 'no voltage for' in lab.status('stage')['text']
+    ramping = lab.until('stage', 'ramping', since=told)
+    assert ramping['level'] == '1' and 'no voltage for' in ramping['text']
     lab.restart(killed)
     # on a busy machine the start takes longer than the identifier waits for a stage in trouble
     reason = ended(lab, seen, 'failed')
     early, late = 'the excitation ended early (idle)', 'no displacement from the stage for 3 s'
-    assert early in reason or (late in reason and 'it says: no voltage' in reason), reason
+    assert early in reason or (late in reason and 'no voltage' in reason), reason
     lab.wait(lambda: lab.status('stage')['state'] == 'idle', 'rest')
+    lab.wait(lambda: applied[-1].values[-1] == 0.0, '0 V')
     since = len(applied)
     seen = run(lab, PROGRAM)
     assert 'the model' in ended(lab, seen, 'done')
@@ -124,13 +125,15 @@ def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
 
 def test_a_stage_that_stops_answering_in_a_run(lab):
     models, stage = len(lab.texts('model')), lab.handle('stage')
-    assert lab.set('identifier', 'excitation_limit', 2.0)[0]
+    # the excitation, too, has so long to answer
+    assert lab.set('identifier', 'excitation_limit', 5.0)[0]
     seen = run(lab, HIGH)
     at_nine_volts(lab)
     stage.send(signal.SIGSTOP)
     try:
         reason = ended(lab, seen, 'failed')
-        assert 'no displacement from the stage for 2 s' in reason
+        # the shorter time where the stage has warned of something last
+        assert re.search('no displacement from the stage for [35] s', reason), reason
         lab.wait(lambda: lab.status('excitation')['state'] == 'stopped', 'the excitation to stop')
     finally:
         stage.send(signal.SIGCONT)
@@ -175,19 +178,17 @@ def test_a_stage_that_refuses_the_rate_ends_the_run(graph):
     graph.start_all(
         ('excitation', half, 'odd'),
         ('stage', {}, 'odd'),
-        ('identifier', {**QUICK, 'excitation_limit': 2.0}, 'odd'),
+        ('identifier', QUICK, 'odd'),
     )
     assert graph.set('odd/identifier', 'program', HIGH)[0]
     ok, reason = graph.call('odd/identifier/run')
     assert ok, reason
-    graph.wait(lambda: graph.status('odd/identifier')['state'] == 'failed', 'the end of the run')
-    reason = graph.status('odd/identifier')['text']
-    assert 'no displacement from the stage for 2 s, none at all' in reason
+    reason = graph.until('odd/identifier', 'failed')['text']
+    # of a stage that warns
+    assert 'no displacement from the stage for 3 s, none at all' in reason
     assert 'it says: a block is refused: it is sampled at 10000 Hz' in reason
-    drive = lambda: graph.status('odd/excitation')  # noqa: E731
-    graph.wait(lambda: drive()['state'] == 'stopped', 'the excitation to stop')
-    assert float(drive()['progress']) < 60.0
-    assert graph.status('odd/stage')['level'] == '1'
+    assert float(graph.until('odd/excitation', 'stopped')['progress']) < 60.0
+    assert '1' in {s['level'] for s in graph.statuses('odd/stage')}
 
 
 def test_an_identifier_that_is_killed_in_a_run(lab):
@@ -221,8 +222,8 @@ def test_an_identifier_that_is_killed_in_a_run(lab):
 
 def test_a_bag_that_ends_early(graph, tmp_path):
     graph.texts('replay/model')
-    # no swarm fits the part of a program that is left
-    quick = {**QUICK, 'solver': 'least_squares'}
+    # no swarm fits the part of a program that is left, and a search of large orders takes long
+    quick = {**QUICK, 'solver': 'least_squares', 'max_order': 2}
     graph.start_all(('player', {}, 'replay'), ('identifier', quick, 'replay'))
     write_bag(simulated(), tmp_path / 'bag')
     (file,) = (tmp_path / 'bag').glob('*.mcap')
