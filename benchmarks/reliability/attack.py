@@ -388,6 +388,9 @@ def start(g: Any, nodes: Mapping[str, Mapping[str, Any]]) -> Attack:
             lambda p=publisher, n=listeners: p.get_subscription_count() >= n, f'listeners, {topic}'
         )
     g.wait(attack.model.get_subscription_count, 'listeners to model')
+    for node in nodes:
+        # who does not know a publisher yet hears nothing of it
+        g._known_to(node)
     return attack
 
 
