@@ -98,10 +98,10 @@ class Driver(LabNode):
 
     def close(self) -> None:
         """Be at rest within a second: a slow ramp that is under way gives way to this one."""
-        self.guard = Guard(self.guard.settings, self.guard.applied)
+        self.guard, due = Guard(self.guard.settings, self.guard.applied), time.monotonic()
         while not self.guard.is_at_rest:
-            due = time.monotonic() + PERIOD
             self._move(self.guard.idle(round(PERIOD * RATE), 0.7), 'ramp:stop')
+            due += PERIOD  # so that what comes late is made up
             time.sleep(max(0.0, due - time.monotonic()))
 
 
