@@ -274,6 +274,7 @@ def test_a_model_node_that_is_killed_and_comes_back(rig):
     # half a second without its displacement, and the estimate goes on alone
     for b in rest:
         rig.send([b])
+        g.wait(lambda b=b: rig.prediction[-1].t[-1] == b.t[-1], 'its prediction')
     g.wait(lambda: len(rig.prediction) >= count + len(rest), 'predictions')
     assert column(rig.prediction[count:])[0].tobytes() == column(rest)[0].tobytes()
     g.wait(lambda: node.status()['text'] == 'with topic model', 'a memory that is known')
