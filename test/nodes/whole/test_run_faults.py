@@ -9,6 +9,7 @@ import signal
 from course import column, FS, HIGH, model_of, PROGRAM, QUICK, simulated
 from graph import ENDS, Graph
 import numpy as np
+from piezo_ident.nodes.exclusive_publisher import LISTEN
 from piezo_ident.record.bags.write import write_bag
 from processes import WORK
 import pytest
@@ -96,7 +97,9 @@ def test_two_excitations_on_one_topic(lab):
     assert lab.status('excitation')['level'] == '1'
     assert other.stop() == 0
     lab.wait(lambda: lab.status('excitation')['level'] == '0', 'the warning to be taken back')
-    assert set(column(sent[since:])[1]) == {9.0}
+    # who pauses for as long as the twin listens is not heard by it before its own first block
+    pause = np.diff(lab.arrivals('voltage')[since:]).max()
+    assert set(column(sent[since:])[1]) == {9.0} or pause > LISTEN
 
 
 def test_an_excitation_that_is_killed_at_nine_volts_and_comes_back(lab):
