@@ -36,7 +36,7 @@ AGAIN = 5.0
 #: states in which a node has ended what it was asked for
 ENDS = ('done', 'failed', 'cancelled', 'stopped')
 #: most messages of a topic that the observer takes at once
-TURN = 1000
+TURN = 50
 #: the observer shares its interpreter with the test, and must not lose what waits for it
 OBSERVED = QoSProfile(depth=20_000)
 #: nor a status that the next one follows at once
