@@ -40,7 +40,9 @@ def lab():
         g.follow('stage', 'stage')
         g.handles.append(Handle(g, 'stage', command, g.folder / 'driver.log'))
         g.wait(lambda: g.statuses('stage'), 'the driver')
-        g.start_all(('identifier',), ('excitation', {'program': PROGRAM, 'subscribers': 3}))
+        # few blocks: a busy machine keeps up with them
+        options = {'program': PROGRAM, 'subscribers': 3, 'block_size': 1000}
+        g.start_all(('identifier',), ('excitation', options))
         for topic in ('displacement', 'applied_voltage'):
             g.matched(topic)
         yield g
@@ -122,7 +124,7 @@ def test_a_second_publisher_is_refused(lab, begin):
     assert lab.set('excitation', 'program', PROGRAM.replace('0.4', '120'))[0]
     assert lab.call('excitation/start')[0]
     # for its first second a driver gives way to another
-    lab.wait(lambda: len(y) > before + 300, 'a stream')
+    lab.wait(lambda: len(y) > before + 30, 'a stream')
     ticks = itertools.count(10_000_000, 100)
     # the first ones may be sent before the stage knows of this publisher
     lab.wait(
@@ -131,7 +133,7 @@ def test_a_second_publisher_is_refused(lab, begin):
         meanwhile=lambda: lab.publish('voltage', block(next(ticks), 0.5, segment='foreign')),
     )
     seen = len(y)
-    lab.wait(lambda: len(y) > seen + 40, 'the stream going on')
+    lab.wait(lambda: len(y) > seen + 20, 'the stream going on')
     assert 'foreign' not in {b.segment for b in y}
     assert np.all(np.diff(column(y[before:], 't')) > 0)
     # from here on the tests drive alone
