@@ -8,7 +8,8 @@ Runs the Python of the tutorial, and writes what comes out into the page and the
 
 The page is the source.  The text block behind a block of Python becomes the output of that block,
 the picture behind one becomes its figure, and ``examples/tutorial.ipynb`` becomes the page without
-outputs, for a reader to run.  The gallery has pictures of the two reports.
+outputs, for a reader to run.  The gallery has pictures of the two reports, and the README one of
+a third.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import io
 import os
 from pathlib import Path
 import re
+import sys
 import tempfile
 from typing import Any
 
@@ -26,8 +28,13 @@ from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 import nbformat
 from nbformat import v4
+import numpy as np
 import piezo_ident as pi
+from piezo_ident.record.record import Piece, Record
 from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+from truths import make_stage
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs/tutorial.md'
@@ -133,8 +140,23 @@ def _draw_gallery(identification: pi.Identification) -> None:
     """Copy the pictures of the reports that the gallery shows, with fewer colours."""
     pi.write_report(identification, 'report')
     for folder, name in IN_GALLERY.findall(GALLERY.read_text(encoding='utf-8')):
-        picture = Image.open(Path(folder, name)).convert('RGB').quantize(64)
-        picture.save(GALLERY.parent / f'images/{folder}_{name}', optimize=True)
+        _copied(Path(folder, name), f'{folder}_{name}')
+
+
+def _draw_readme() -> None:
+    """Identify a stage with a density of plays, and copy the picture of its loops."""
+    played = pi.Program.load('identification').build()
+    t, v = np.arange(played.n) / played.sample_rate, played.v
+    y = make_stage('creep', 0.3, 1, noise='white').respond(t, v, changed=False)
+    piece = Piece(v, y, played.sample_rate, segments=tuple(played.segments))
+    pi.write_report(pi.identify(Record((piece,), 'identification')), 'plays')
+    _copied(Path('plays/loops.png'), 'loops.png')
+
+
+def _copied(picture: Path, name: str) -> None:
+    """Copy a picture to those of the pages, with fewer colours."""
+    few = Image.open(picture).convert('RGB').quantize(64)
+    few.save(GALLERY.parent / 'images' / name, optimize=True)
 
 
 def main() -> None:
@@ -148,6 +170,7 @@ def main() -> None:
         names: dict[str, Any] = {}
         text = _refreshed(text, names)
         _draw_gallery(names['identification'])
+        _draw_readme()
         os.chdir(before)
     PAGE.write_text(text, encoding='utf-8')
     nbformat.write(notebook(text), NOTEBOOK)
