@@ -331,7 +331,9 @@ def _to_come(gain: float, last: float, more: int) -> float:
 
 
 def _loss(e: Array, pull: Pull | None) -> float:
-    return float(e @ e) + (0.0 if pull is None else pull.s)
+    # a model that runs away overflows: `_Fit.step` refuses it
+    with np.errstate(over='ignore'):
+        return float(e @ e) + (0.0 if pull is None else pull.s)
 
 
 def _derivatives(
