@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Creep of a piezo ceramic: slow first-order elements in parallel with H, in units of H."""
+"""Creep of a piezo ceramic: slow first-order elements that the output of H drives."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def _crept(h: Array, c: Array, rate: Array, state: Array) -> Array:
 
 class Creep(Effect):
     """
-    Linear creep: a sum of slow first-order elements behind H.
+    Linear creep: H plus a sum of slow first-order elements that H drives.
 
-    Each element follows ``x_i(k) = a_i x_i(k-1) + (1 - a_i) h(k)`` with
-    ``a_i = exp(-1 / (f_s tau_i))``, and the output is ``h + sum_i c_i x_i``.  Time constants
+    Each element follows the output h of H, ``x_i(k) = a_i x_i(k-1) + (1 - a_i) h(k)`` with
+    ``a_i = exp(-1 / (f_s tau_i))``.  The output is ``h + sum_i c_i x_i``.  Time constants
     that are spread over decades imitate the logarithmic law of piezo ceramics: one element a
     decade with ``c_i = gamma`` creeps by gamma a decade.
 

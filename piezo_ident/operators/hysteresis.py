@@ -10,11 +10,11 @@ of Gu, Li, Zhu and Su (2016), doi:10.1109/TMECH.2015.2465868, in normalised unit
 
     p0 v^2 + sum_i (c_i1 t_i^2 + c_i2 t_i^3 + c_i3 t_i^4) + sum_i kappa_i (v - low) (F_ri[v] - low)
 
-with ``t_i = F_ri[v] - low``, held between 0 and ``high - low - r_i``.  A sum of functions of play
-outputs is a Preisach operator.  Its density over threshold and output is the derivative of these
-functions: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996, sections 2.3 to 2.5,
-doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are not a Preisach operator.
-All of these terms have the play outputs as their memory.
+over a span low .. high of v, with ``t_i = F_ri[v] - low`` held in 0 .. ``high - low - r_i``.  A
+sum of functions of play outputs is a Preisach operator.  Its density over threshold and output is
+the derivative of these functions: Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996,
+sections 2.3 to 2.5, doi:10.1007/978-1-4612-4048-8.  Plays weighted by the voltage (kappa) are no
+Preisach operator.  The memory of all these terms is the play outputs.
 
 A semilinear Duhem model adds ``sum_j z_j - phi_j(v)`` with ``dz_j = a_j |dv| (phi_j(v) - z_j)``
 and cubic phi_j.  A lag z_j decays along the path of v, at any speed, and has no return point
@@ -40,11 +40,11 @@ from piezo_ident.operators.play import initial_memory
 
 #: number of powers t^2 .. t^4 in the curve of a play
 POWERS = 3
-#: number of plays that run side by side in vector lanes; idle plays fill up the last group
+#: number of plays that run side by side in vector lanes; plays without weight fill the last group
 LANES = 8
 #: largest negative density that counts as rounding, as a share of the largest density
 ROUNDING = 1e-9
-#: threshold [spans] below which a play counts as a line: no converter makes so small a step
+#: threshold [spans] below which a play is a line, F = v: no converter makes so small a step
 LINE = 1e-9
 
 
@@ -304,7 +304,7 @@ class Hysteresis:
         return initial_memory(v0, self.thresholds)
 
     def __call__(self, v: ArrayLike, memory: ArrayLike | None = None) -> Array:
-        """Compute w for a normalised v, shapes (n,), from a memory, shape (m,) or (m + k,)."""
+        """Compute w for a normalised v, shapes (n,), from a memory as in `follow`."""
         x = np.asarray(v, dtype=np.float64)
         start = self.initial_memory(float(x[0])) if memory is None else np.asarray(memory, float)
         return self.follow(x, start)[0]
