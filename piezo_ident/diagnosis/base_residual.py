@@ -4,8 +4,8 @@
 """
 Leave out faults, refit H, and find lines and noise in the residual, before effects are searched.
 
-The residual of the model as given shows the faults.  H is then refitted by the free-run error, as
-plays and by a wide law.  The residual of the wide law shows lines, other axes and the noise.
+The residual of the model as given shows faults of the data.  H is then refitted as plays and by a
+wide law.  The residual of the wide law shows lines (hum), further channels (axes) and the noise.
 """
 
 from __future__ import annotations

@@ -5,9 +5,10 @@
 List the candidates: sets of effects, each beside treatments of H (given, plays, wide) and G.
 
 The hysteresis of a piezo is never exactly a sum of plays, and an effect during the identification
-has distorted H and G.  Each effect is therefore tried beside the best H, and beside a retuned G if
-retuning alone clearly lowers the error.  Effects of the path are tried beside the given H, too.
-The best sets get all treatments.  One more effect is added if more than `LITTLE` is left.
+has distorted H and G.  Each effect is therefore tried beside the best H, and beside a retuned G
+(G times a factor near one) if retuning alone clearly lowers the error.  Effects of the path of the
+voltage, the same at any speed, are tried beside the given H, too.  The best sets get all
+treatments.  One more effect is added if more than `LITTLE` is left.
 """
 
 from __future__ import annotations

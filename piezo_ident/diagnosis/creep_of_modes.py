@@ -4,10 +4,9 @@
 """
 Add the creep of each axis to shared modes, if slow motion that is held out shows it.
 
-The error of slow motion is compared with and without creep as in
-`piezo_ident.selection.comparison`: parts of the time are held out, and whole kinds of motion.
-Errors of a kind count relative to their rms without creep.  Otherwise creep would imitate errors
-of the modes on wide motion, and spoil the prediction of other motion.
+As in `selection.comparison`, parts of the time and whole kinds of motion are held out.  Errors of
+a kind count relative to their rms without creep.  Otherwise creep would imitate errors of the
+modes on wide motion, and spoil the prediction of other motion.
 """
 
 from __future__ import annotations

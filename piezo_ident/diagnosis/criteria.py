@@ -33,7 +33,7 @@ BEYOND_CHANCE = 1.5
 #: a difference is significant from so many standard errors over held-out blocks (95 % of a normal
 #: variable)
 STANDARD_ERRORS = 2.0
-#: accepted range of kappa, the size of an effect where it alone acts (`trial_scores`); 1 is exact
+#: accepted range of kappa: size of an effect where it alone acts, over its size in all data
 SHOWS = (0.4, 3.0)
 #: a testable candidate has a larger share of its columns outside the span of the base.  At this
 #: share its amplitude is known a hundred times less accurately

@@ -10,17 +10,22 @@ out.  The error of a set is the error of its best treatment:
 
     left(K) = max(E(K) - noise, 0) + NOISE_SHARE noise.
 
-A set is admissible if left falls by the square of `SMALLEST_EFFECT` from the H as given, and if
+After `PASSES` of the range, a set is admissible if
 
-    left(K) <= TAKES^(|K| - |K'|) left(K')     for every part K' of K, the empty set included,
+- left falls by the square of `SMALLEST_EFFECT` from the H as given;
+- left(K) <= TAKES^(|K| - |K'|) left(K') for every part K' of K, the empty set included, and on
+  interleaved blocks alone if K' has an effect;
+- a change of G in K exceeds the known error of G; beside a K without such a change, a K' with a
+  change of G within this error counts as a part, too;
+- left(K) is at most `TAKES` of left with a special case in the place of an effect (`contains`);
+- the last effect gains `BEYOND_CHANCE` times the gain by chance, unless it follows time alone.
 
-and on interleaved blocks alone if K' has an effect.  A change of G must exceed the known error of
-G, and the last effect must gain more than chance.  The set that leaves least is taken, or a set
-with fewer parameters within `ALIKE`.  Sets of its size within `RIVALS` form a class with it.
+The set that leaves least is taken, or a set with fewer parameters within `ALIKE`.  Sets of its
+size within `RIVALS`, or further if it explains only a part, form a class with it.
 
-A wide H imitates an effect of the path of the voltage.  If no set is admissible in labelled
-records, such an effect may be taken beside the given H.  Its gain must reach ``1 - TAKES`` of the
-gain of the best refit.  The effect has then set in since the identification.
+A wide H imitates an effect of the path: an effect that is the same at any speed.  If no set is
+admissible in labelled records, such an effect may be taken beside the given H.  Its gain must
+reach ``1 - TAKES`` of the gain of the best refit.  It has then set in since the identification.
 """
 
 from __future__ import annotations
@@ -47,7 +52,7 @@ from piezo_ident.diagnosis.rows import Rows
 from piezo_ident.diagnosis.search import Round
 from piezo_ident.effects import find_effect
 
-#: effect that any material shows a little, as its minor loops are never quite congruent
+#: effect that never counts as set in: minor loops of any material are not quite congruent
 OF_MATERIALS = 'noncongruent_minor_loops'
 
 

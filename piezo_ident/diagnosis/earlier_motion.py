@@ -5,8 +5,8 @@
 Fit creep that continues from motion before a record.
 
 A stage creeps for minutes after a motion, so creep has rarely settled at the start of a record.
-The remaining creep of each element adds ``d_i exp(-t / tau_i)`` to the displacement.  The
-prediction is linear in these amplitudes, a few numbers for each record.
+The remaining creep of element i adds ``A_i exp(-t / tau_i)`` to the displacement, with an
+amplitude A_i for each record.  The prediction is linear in the A_i.
 """
 
 from __future__ import annotations

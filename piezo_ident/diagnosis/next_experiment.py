@@ -4,10 +4,9 @@
 """
 Suggest the next experiment: the excitation that answers the questions these data leave open.
 
-Each effect shows in some motions and hides in others.  Some effects imitate each other if one
-kind of motion is missing.  Example: creep, and thresholds that grow with the speed, both lower the
-slope of a loop as the frequency rises.  The suggestion names motions that separate the doubtful
-effects and that the data lack.
+Some effects imitate each other if one kind of motion is missing.  Example: creep, and thresholds
+that grow with the speed, both lower the slope of a loop as the frequency rises.  The suggestion
+names motions that separate the doubtful effects and that the data lack.
 """
 
 from __future__ import annotations

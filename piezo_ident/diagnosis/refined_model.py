@@ -1,11 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Build the refined model from the parts of a fit that hold in other records, too.
-
-The effects that were added are reported with their shares and parameters.
-"""
+"""Build the refined model from what holds in other records, too; report the added effects."""
 
 from __future__ import annotations
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Run the chain of one run, and pass small changes of a signal through the links behind H.
+Simulate a run link by link, and pass small changes of a signal through the links behind H.
 
-Most links are linear, or only add to the signal.  They pass a change without the signal itself.
-Many columns of a fit therefore pass the links without a run of the whole chain.
+A run is a piece of a record, and a link is one operator of the model.  Most links are linear or
+only add to the signal, so a change passes them without the signal, and without the whole chain.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Behind:
 
 class RunChain:
     """
-    Links of one run, at rest under its first command.
+    Links of the model for one run, at rest under the first command of the run.
 
     `rests` holds the signals at rest before each link and behind the last.  `blocks` holds the
     signals of the run at these places, if they are kept.

@@ -36,7 +36,7 @@ from piezo_ident.diagnosis.trial_scores import (
 from piezo_ident.effects import Effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-#: number of surrogates of the residual: chance exceeds their largest gain in 1 of 17 cases
+#: number of surrogates (shifts of the residual): chance exceeds all their gains in 1 of 17 cases
 SURROGATES = 16
 #: share of the error that a trial must gain for a joint fit, and most joint fits in a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
@@ -45,8 +45,8 @@ WORTH_END = 0.5
 #: trials of a candidate that start a joint fit, iterations of this fit, and candidates of a round
 #: that are fitted to the end
 STARTS, FIRST, FINAL = 2, 3, 2
-#: largest errors that are followed: a start beside plays over the error before; another start over
-#: the best start of its effect; another candidate over the best candidate
+#: largest errors that are followed, over another error: of a start beside plays, over the error
+#: before; of another start, over the best start; of a candidate, over the best candidate
 PLAIN_START, AHEAD, FORM_RATIO = 1.6, 1.6, 4.0
 #: a further candidate is fitted to the end up to this multiple of the error of the last one
 LEVEL = 1.05
@@ -114,7 +114,7 @@ def search_round(
         every.setdefault(scored.effect.name, []).append(scored)
     possible = {name: [s for s in own if s.error < np.inf] for name, own in every.items()}
     trials = {name: sorted(own, key=_by_error) for name, own in possible.items() if own}
-    # the law with the best small step may not be the law with the best fit
+    # the trial with the best small step may not be the trial with the best fit
     starts = {
         scores[0].effect: [
             before.state.with_effect(started(columns.rows, s)) for s in scores[:STARTS]

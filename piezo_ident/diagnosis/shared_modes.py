@@ -16,7 +16,7 @@ one multisine of each amplitude that is held out:
 Hysteresis inside the loop moves the modes with the amplitude.  Hysteresis in front of the
 mechanics changes gain and phase, not the modes.  `loop_hysteresis` needs linear models of each
 amplitude that err by `LAW_GAIN` less with modes of their own than with common modes.  A law inside
-the loop must also leave at most `TAKES` of the mean square error of the chains.
+the loop must also leave at most `TAKES` of the mean square error of the chains, H and G by axis.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 """
 Describe the state of a joint fit, the numbers that the fit may move, and their priors.
 
-The state holds H, the offset of each record, a retuned G, and the effects of a model under study.
+The state holds H, the offset of each record, the factor near one of a retuned G, and the effects.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 """
 Score the trials of candidates by their gain on held-out data.
 
-A trial has a column for each amplitude of an effect: the change of the prediction per small step.
-Least squares fits these columns beside the columns of the model to the residual.  The score is the
-squared error on interleaved held-out blocks.
+A trial is an effect whose other parameters, such as time constants, are fixed.  Each amplitude has
+a column: the change of the prediction per small step.  Least squares fits these columns beside the
+columns of the model to the residual.  The score is the squared error on held-out blocks.
 
 Trials cannot separate all effects.  Creep and drift must show at rest, where no hysteresis moves.
 A drifting gain must show within single motions, where a gain that depends on the kind of motion

@@ -4,10 +4,10 @@
 """
 Judge the decision: the findings, their certainty, and the questions that the data leave open.
 
-The set of effects that was taken is named, or a class if it has rivals.  If it leaves more than
-`LITTLE` of the error, and more than `SMALLEST_EFFECT`, it explains a part.  If no set was taken,
-the H that `refits.walk` took is the finding if it gains at least `SMALLEST_EFFECT`.  Effects that
-explain nearly as much may hide in this H.
+The set of effects that was taken is named.  The verdict is a class if the set has rivals, or
+look-alikes that were no candidates.  If the set leaves more than `LITTLE` of the error, and at
+least `SMALLEST_EFFECT`, it explains a part.  If no set was taken, the H of `refits.walk` is the
+finding if it gains `SMALLEST_EFFECT`.  Effects that explain nearly as much may hide in this H.
 """
 
 from __future__ import annotations
