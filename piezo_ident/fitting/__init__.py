@@ -5,6 +5,6 @@
 Fit a stage by free-run error.
 
 `stretch` holds the measured motion, `stage` the parameters and their derivatives, `free_run` the
-fit, `damped` the Gauss-Newton loop, `equations` the normal equations block by block.  `adaptation`
-fits a stage that runs, sample by sample, with the loops of `adaptation_kernel`.
+fit, `damped` its steps, `equations` its blocks, `jackknife` the fit without each block.  For a
+stage that runs, `adaptation` learns changes, and `attribution` names the part that changed.
 """

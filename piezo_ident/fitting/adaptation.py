@@ -5,8 +5,8 @@
 Learn the gain of a running stage slowly, and on request its hysteresis.
 
 The learnt displacement is the free run plus a sum of terms theta_j f_j.  Each f_j is the response
-to one change of the model.  The model may change its gain, the weights of its plays (by hats over
-their thresholds), its cubic, or the gains of its creep.  A changed model runs for each f_j, so
+to one change of the model.  The model may change its gain, the weights of its plays (by hats:
+triangles over the thresholds), its cubic, or its creep.  A changed model runs for each f_j, so
 amplifier, creep, G and delay act on the change as they act on the stage.  If modes that axes share
 predict, the gain alone is learnt, and f is the free run about the zero.  A high-pass removes
 offset, drift and creep of earlier motion from the f_j and from the measured error; the observer
@@ -61,7 +61,7 @@ MEMORY = 1.5
 #: time of refused measurements after which they are believed [s]: the high-pass has forgotten a
 #: step of the sensor by then
 PATIENCE = 6.0 * SLOW
-#: hats over the thresholds (taste: as many as the wider laws of H have)
+#: number of hats over the thresholds (taste: as many as the wider laws of H have)
 HATS = 5
 #: rms size of each change: of weights, of the cubic in normalised units, of the gains of creep
 #: (taste: a third)

@@ -35,7 +35,7 @@ ORDERS, ROUGH = (1, 2, 3, 4, 6, 8, 10), (2, 4, 8)
 WIDER: tuple[LawName, ...] = ('preisach', 'duhem')
 #: span of these laws, normalised: it exceeds the range, so their densities are smooth at its ends
 WIDE = (-0.15, 1.15)
-#: first guess of an unknown memory at a start: all shares in the middle
+#: first guess of an unknown memory at a start: all shares m (`fitting.stage`) in the middle
 UNKNOWN = 0.5
 #: iterations of a rough fit and of a final fit
 FEW, MANY = 6, 15

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Identify a stage from its records: in three steps, or by one fit if nothing is labelled.
+Identify a stage: in three steps if noise and a triangle are labelled, else by one fit.
 
 Gu, Li, Zhu and Su, "Modeling and Identification of Piezoelectric-Actuated Stages Cascading
 Hysteresis Nonlinearity With Linear Dynamics", IEEE/ASME Trans. Mechatronics 21(3), 2016,
@@ -59,7 +59,7 @@ def identify(
     progress: Progress = silent,
     steps: Steps | None = None,
 ) -> Identification:
-    """Identify a stage of one axis; `piezo_ident.identify` adds the promise to the result."""
+    """Identify one axis; `piezo_ident.identify` adds the promise, the error on other records."""
     return identify_and_judge(records, settings, validation, progress, steps)[0]
 
 
@@ -122,7 +122,7 @@ def _identify(
 def _fitted(
     data: Prepared, settings: Settings, progress: Progress, steps: Steps | None
 ) -> FitOutcome:
-    """Fit in three steps, or in free run data without labels and for the solver joint."""
+    """Fit in three steps; without the labels, or for the solver joint, fit all by free runs."""
     runs, scaling = data.runs, data.scaling
     in_steps = data.labelled and settings.solver != 'joint'
     if not in_steps and steps is not None:

@@ -5,9 +5,9 @@
 Fit the unknown memory of labelled runs that do not start at the lowest voltage.
 
 A play may stand still at an unknown output until the voltage has moved by its threshold.  A
-free-run fit varies the outputs at the start and the weights together.  A run is thinned to the
-extremes and the last sample of each block, because extremes decide the play outputs.  The fit
-compares the displacement at the last samples.  It begins at several guesses and keeps the best.
+free-run fit varies weights and start together; the shares m of `fitting.stage` describe the start.
+Each block of a run is thinned to its extremes, which decide the play outputs, and its last sample,
+at which the fit compares the displacement.  The best of several guesses is kept.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ROUGH, BLOCKS = 500, 2000
 PLAYS, FIT_BLOCKS = 40, 50
 #: number of shares of the fitted memory for each share of a guess
 FINER = 2
-#: shares m of plays that a rise before the start has pushed up, and that a fall has pushed down
+#: shares m of plays that a last rise has pushed up, and that a last fall has pushed down
 ENDS = (0.9, 0.1)
 #: iterations from every guess, iterations from the best guesses, and number of best guesses
 FEW, MANY, BEST = 3, 15, 1

@@ -7,7 +7,7 @@ Step 2: find G from noise, with the hysteresis undone.
 Noise moves the plays, and a linear fit takes their motion for slow dynamics.  G is therefore found
 twice.  After a first G, a temporary H with fine thresholds is fitted to the triangle.  Its output
 w = H[v] replaces the voltage.  The orders are ranked by the held-out free-run error from w to y.
-The best few are refined on noise and steps, and their held-out error chooses, without slow poles.
+The best few, without slow poles, are refined on noise and steps.  Their held-out error chooses.
 """
 
 from __future__ import annotations

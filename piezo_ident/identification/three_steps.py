@@ -115,7 +115,7 @@ class _LabelledFitter:
     delay: Delay
 
     def fitted(self, dynamics: DynamicsResult, G: Dynamics, lean: bool) -> _Fitted:
-        """Fit the starts and H with this G; G is refined if H is not a sum of plays."""
+        """Fit starts and H beside G; refine G if H is no sum of plays, if `lean` without pairs."""
         settings, progress, delay = self.settings, self.progress, self.delay
         # fit the starts again with the lag of this G
         runs = with_starts(self.runs, lag_of(G, delay))

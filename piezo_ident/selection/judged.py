@@ -1,7 +1,7 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Errors of a model sample by sample, and the promise for other records."""
+"""Errors of a model sample by sample, and its promise: the errors on other records."""
 
 from __future__ import annotations
 
