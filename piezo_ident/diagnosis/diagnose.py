@@ -4,8 +4,8 @@
 """
 Diagnose a model: from measured data to the effect that the model lacks.
 
-1. `base_residual` leaves faults of the data out and refits H.  The residual that remains gives
-   lines and the noise.
+1. `rows` cuts the records into rows and blocks, and `simulator` runs the model over them.
+   `base_residual` leaves faults of the data out and refits H.  The rest gives lines and the noise.
 2. `candidates` fits each treatment of H and G, then with each effect, then with one more effect.
    `search` finds the effects of a round: `trial_scores` scores them, `joint_fit` fits the best.
 3. `decision` takes a set of effects by ratios of errors on held-out data.

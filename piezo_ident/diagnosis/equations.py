@@ -30,7 +30,7 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Pull:
-    """Normal equations of information besides the rows, (p, p) and (p,), and sum of squares."""
+    """Normal equations of a prior or the given H, (p, p) and (p,), and its sum of squares."""
 
     A: Array
     b: Array

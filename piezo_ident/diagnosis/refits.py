@@ -5,8 +5,9 @@
 Refit H, and choose the H of the refined model.
 
 The walk tries the given H, then plays, a retuned G, wide laws, and a wide law with a retuned G.
-A step is taken if it leaves at most `TAKES` of the error on whole kinds of motion.  Interleaved
-blocks could choose a wide H with a retuned G that errs widely under other motion.
+A step is taken if at most `TAKES` of the error of the last one taken is left, on whole kinds of
+motion: blocks alone could choose a wide H with a retuned G that errs widely under other motion.
+Without an effect, another gain of the given H is preferred to a step that is slightly better.
 """
 
 from __future__ import annotations
@@ -262,10 +263,10 @@ def toward_given(
 
         min  |e|^2 + n mean((h - h_0 - c)^2)
 
-    h and h_0 are the new and the given H under loops over the range of the model, and n is the
-    number of rows.  Offsets compensate the mean difference c.  The given H keeps terms small that
-    compensate for one another on these rows, but not elsewhere.  If the data cover only a part of
-    the range, the given H does not count, and the refined model holds in this part only.
+    h and h_0 are the new and the given H under loops over the range of the model; n counts rows.
+    Offsets compensate the mean difference c.  The given H keeps terms small that compensate each
+    other on these rows alone.  If the data cover only a part of the range, the given H does not
+    count, and the refined model holds in this part only.
     """
     law, rows, scaling = fitted.state.law, simulator.rows, simulator.model.scaling
     if law is None or rows.kinds or not rows.covers(scaling.range):

@@ -137,7 +137,7 @@ def find_shared_modes(
     ----------
     chains : MultiAxisModel
     sines : Multisines
-        Of the records.
+        Multisines in the records.
     records : sequence of Record
     progress : callable
     tests : bool

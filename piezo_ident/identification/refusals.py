@@ -41,13 +41,13 @@ def refuse_undriven(records: Sequence[Record]) -> None:
     """
     Refuse records whose displacement does not answer the voltage, with an IdentificationError.
 
-    Either of two proofs accepts the records.  First, the spectra of voltage and displacement are
-    more coherent at some frequency than by chance (1e-7).  For Gaussian noise the chance of a
-    coherence c over L segments is ``1 - c`` raised to ``L - 1``, for any displacement.  Each
-    segment is detrended, because two drifts agree by chance.  Segments with their trends count,
-    too, if the voltage moves by far more than its noise.  Second, a model with the voltage errs by
-    `BETTER` less on predicted parts of a record than all models without it.  A single loop of
-    strong hysteresis needs this proof, as its coherence is low.
+    A piece below `MIN_COHERENCE` or either of two proofs accepts the records.  First, the spectra
+    of voltage and displacement are more coherent at some frequency than by chance (1e-7).  For
+    Gaussian noise the chance of a coherence c over L segments is ``1 - c`` raised to ``L - 1``.
+    Each segment is detrended, because two drifts agree by chance.  Segments with their trends
+    count, too, if the voltage moves by far more than its noise.  Second, a model with the voltage
+    errs by `BETTER` less on predicted parts of a record than all models without it.  A single loop
+    of strong hysteresis needs this proof, as its coherence is low.
     """
     pieces = [piece for record in records for piece in record if np.ptp(piece.v) > 0.0]
     if any(piece.n < MIN_COHERENCE for piece in pieces):

@@ -137,7 +137,7 @@ class SharedRuns:
     errors : mapping of str to float
         Errors of each law and of the chains on multisines held out, % of rms(y) of all axes.
     runs : tuple of PieceRun
-        The modes have no hysteresis of their own: its displacement is that of the whole model.
+        The modes do not run without dynamics: `y_static` is the displacement of the whole model.
     """
 
     law: str
