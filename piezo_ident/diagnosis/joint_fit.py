@@ -4,9 +4,8 @@
 """
 Fit the weights of H, offsets and effects jointly by the free-run error.
 
-The fit uses Gauss-Newton steps with the damping of Levenberg and Marquardt.  G and the delay stay,
-except for a factor near one (`state.retuned`).  A larger change of them is an effect, and so a
-candidate.
+The damping of the Gauss-Newton steps is that of Levenberg and Marquardt.  G and the delay stay but
+for a factor near one (`state.retuned`).  A larger change of them is an effect, so a candidate.
 """
 
 from __future__ import annotations
