@@ -1,4 +1,4 @@
 # Copyright 2026 The piezo_ident authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Solvers: particle swarm, bounded least squares, output error."""
+"""Solvers: ARX, output error, bounded least squares, particle swarm."""
