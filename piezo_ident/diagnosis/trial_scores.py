@@ -16,7 +16,7 @@ stays constant.  There the effect must have the size that was fitted to all data
 
 measures this size.  c is the contribution of the effect, and e is the residual with the effect in
 the model.  Terms that may differ between rests, or between motions, are projected out of c and e.
-kappa must lie within `SHOWS`: it is 1 for the right effect, and any number for a wrong effect.
+kappa must lie within `SHOWS`, beyond `STANDARD_ERRORS`.  The right effect has 1, a wrong one any.
 """
 
 from __future__ import annotations
