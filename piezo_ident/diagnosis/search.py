@@ -36,7 +36,7 @@ from piezo_ident.diagnosis.trial_scores import (
 from piezo_ident.effects import Effect
 from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
-#: number of surrogates (shifts of the residual): chance exceeds all their gains in 1 of 17 cases
+#: number of surrogates (shifted residuals): chance exceeds all their gains in about 1 of 17 cases
 SURROGATES = 16
 #: share of the error that a trial must gain for a joint fit, and most joint fits in a round
 WORTH_FIT, JOINT_FITS = 0.05, 4
