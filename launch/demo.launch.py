@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-All of stage.launch.py, with its arguments, and a recorder; then call the identifier.
+Start the nodes of stage.launch.py, with its arguments, and a recorder; then call the identifier.
 
     ros2 launch piezo_ident demo.launch.py
     ros2 service call /identifier/run std_srvs/srv/Trigger

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-One stage in a namespace: excitation, stage (or a DAQ driver of your own), identifier, model.
+Start one stage: excitation, simulated stage or your own driver, identifier and model.
+
+With `reference` a feedforward node takes the place of the identifier.
 
     ros2 launch piezo_ident stage.launch.py -s
     ros2 launch piezo_ident stage.launch.py namespace:=left use_simulated_stage:=false

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A stage that follows a reference: stage.launch.py, with its arguments, in its tracking form.
+Start a stage that follows a reference: stage.launch.py with its arguments, and `reference`.
 
     ros2 launch piezo_ident track.launch.py model:=refined.yaml
     ros2 service call /feedforward/start std_srvs/srv/Trigger

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-All of stage.launch.py, with its arguments, for a stage of two axes; then call the identifier.
+Start the nodes of stage.launch.py, with its arguments, for two axes; then call the identifier.
 
     ros2 launch piezo_ident two_axes.launch.py
     ros2 service call /identifier/run std_srvs/srv/Trigger
