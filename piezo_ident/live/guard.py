@@ -13,7 +13,7 @@ A command may leave the limits, jump, hold NaN, stop, or start over.  The guard 
 - it joins a new stream softly: the distance between the applied and the commanded voltage fades
   out along a raised cosine.
 
-The simulated stage and the excitation use the guard; a driver of real hardware should, too.
+Stage, excitation and feedforward use the guard; a driver of real hardware should, too.
 """
 
 from __future__ import annotations

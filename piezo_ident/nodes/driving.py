@@ -40,8 +40,8 @@ class DrivingNode(LabNode):
     """
     Node that takes the right to drive, and gives it back when the stage rests after a stop.
 
-    A timer calls `work` every `PERIOD` until a stop, and then ramps to rest.  A subclass sets the
-    tracker before it drives, and publishes its state in `report_state`.
+    A timer waits for the right, calls `work` every `PERIOD` until a stop, and then ramps to rest.
+    A subclass sets the tracker before it drives, and publishes its state in `report_state`.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -116,7 +116,7 @@ class DrivingNode(LabNode):
         self._counts['samples'] += t.size
 
     def _note_second(self) -> None:
-        """Note a second publisher of a voltage as a fault."""
+        """Note a second publisher of a voltage as a fault; the node drives on."""
         for tail, output in zip(self._tails, self._outputs, strict=True):
             if second := output.second() if output.is_open else '':
                 self._faults.note('second', f'second publisher {second} on voltage{tail}', 0)

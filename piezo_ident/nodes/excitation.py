@@ -19,10 +19,10 @@ With `axes` the node drives several axes, each on its own topic with its own ran
 begin, end and stop together.
 
 Two programs at once would tear the stage to and fro.  The node therefore refuses to start beside a
-second publisher on `voltage`, and reports a publisher that comes later.  The middleware lists a
-killed excitation for some 20 s.  A silent publisher of the node's own name counts as killed; the
+second publisher on its topic, and only reports a publisher that comes later.  The middleware lists
+a killed excitation for some 20 s.  A silent publisher of the node's own name counts as killed; the
 node listens for half a second before the first block.  Two nodes of one name that start together
-hear each other in their first second, and both end.
+hear each other in their first second; both ramp to rest, and their programs fail.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ is silent for `silence`, the node plays its remaining part and ramps to rest.  `
 and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
 
 ``~/learn`` repeats the last reference, and corrects the voltage by the measured error, until the
-error stops falling.  A further call goes on from the best repetition.
+error stops falling or for `repetitions`.  A further call goes on from the best repetition.
 
 With `axes` the node follows `reference_<name>` on `voltage_<name>`, too.  The inverse cancels the
 coupling of the axes.  A block of `reference` waits up to `PATIENCE` for the blocks of the other
@@ -28,8 +28,8 @@ A new model of several axes waits until the next ``~/start`` or ``~/learn``.
 from the stage, as in micrometres | the block is refused | WARN |
 | a sample that is NaN or infinite | the last sample is repeated | WARN |
 | a gap up to `silence` | a straight line | WARN |
-| another stream | is joined from where the first one ended | |
-| out of reach | the voltage stays at its limit | WARN |
+| another stream | the node joins it from where the first one ended | |
+| a reference out of reach | the voltage stays at its limit | WARN |
 | modes that run away | the node ramps to rest and fails | WARN |
 | no displacement | the node drives on, without a tracking error | WARN |
 """

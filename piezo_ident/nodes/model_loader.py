@@ -37,7 +37,7 @@ class ModelLoader(Generic[T]):
     several waiting models the thread reads the newest alone.
 
     The thread calls `prepare` with a model.  The executor of the node then calls `take` with the
-    prepared model and its source, or with None and an error, and `done` after all such calls.
+    prepared model and its source, or with None and an error.  Last, the executor calls `done`.
     """
 
     def __init__(

@@ -4,8 +4,8 @@
 """
 Declare every parameter of every node: default, unit, range and meaning.
 
-The nodes take their parameters from here, and the tables of the documentation are made from here.
-Tests compare the YAML files in ``config/`` with these declarations.
+The nodes take their parameters from here.  Tests compare the tables of ``docs/graph.md`` and the
+YAML files in ``config/`` with these declarations.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Declaration:
 
 
 def with_axes(topics: Sequence[str], axes: Sequence[str]) -> list[str]:
-    """Add the topics of further axes to those of the first axis."""
+    """Add to topics of the first axis the topics of further axes, such as ``voltage_b``."""
     names, kinds = [name for name in axes if name], (*SAMPLE_TOPICS, 'corrections')
     return [*topics, *(f'{t}_{name}' for name in names for t in topics if t in kinds)]
 

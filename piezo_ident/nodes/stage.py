@@ -10,8 +10,8 @@ answers by a block of `displacement` and a block of `applied_voltage`, with the 
 
 A second axis has a guard and topics of its own: `voltage_b`, `displacement_b`,
 `applied_voltage_b`.  A block of `voltage` waits for the block of `voltage_b` with the same t, for
-`PATIENCE` or half of `silence`.  Without that block the last voltage of the second axis stays in
-force.  A second axis without a publisher stays at rest.
+the shorter of `PATIENCE` and half of `silence`.  Without that block the last voltage of the second
+axis stays in force.  A second axis without a publisher stays at rest.
 
 Like a real stage, the stage keeps its memory from stream to stream, and its own clock (for drift
 and hum) goes on.
@@ -22,12 +22,12 @@ and hum) goes on.
 | a sample that is NaN or infinite | the last command stays in force for it | WARN |
 | outside the limits, faster than the slew | at the limit; followed at the slew | WARN |
 | a block that came before | ignored: no displacement, the stage does not move | WARN |
-| a gap up to `silence`, and 10 s | the stage holds its voltage for as many ticks, reported on \
-`applied_voltage` as `hold:gap`; no displacement is published for them; the stream is then \
-followed at the slew | WARN |
+| a gap up to `silence`, at most 10 s | the stage holds its voltage for as many ticks, on \
+`applied_voltage` as `hold:gap`, and publishes no displacement for them; the guard then follows \
+the stream at the slew | WARN |
 | a longer gap | a new stream | WARN |
 | swapped blocks | the early one makes a gap, the late one is refused: its time has passed | WARN |
-| another block size | nothing: blocks are cut as they come | |
+| another block size | the answer has the same size | |
 | t jumps back to where the stream began, or by more than 1000 samples | a new stream, joined by \
 a ramp | |
 | t jumps back otherwise | the block is refused: its time has passed | WARN |

@@ -58,8 +58,8 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     """
     Convert a message to a block, of one of the `quantities` if they are named.
 
-    All nodes call this function, so all refuse the same messages.  Values may be NaN or infinite;
-    each node documents its answer.
+    All nodes that take blocks call this function, so they refuse the same messages.  Values may be
+    NaN or infinite; each node documents its answer.
 
     DataError for another layout or quantity, a layout that contradicts the data, a block above the
     largest size, and time stamps that are not consecutive.
