@@ -21,9 +21,9 @@ EVERY = 0.1
 
 class Worker:
     """
-    Runs one job at a time in a process of the niceness `nice`, without delaying the caller.
+    Runs one job at a time in a process, without delaying the caller.
 
-    The process first calls `warm_up`, a function of a module.
+    Above 0 `nice` lowers the priority.  The process first calls `warm_up`, a function of a module.
     """
 
     def __init__(self, nice: int = 0, warm_up: Callable[[], object] | None = None) -> None:
@@ -74,7 +74,7 @@ class Worker:
             ended(result, None)
 
     def cancel(self) -> None:
-        """Cancel the job, which ends at its next tick; return at once."""
+        """Cancel the job at its next tick, or else with its process; return at once."""
         self._cancel.set()
 
     def join(self, timeout: float) -> bool:
