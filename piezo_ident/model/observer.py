@@ -16,8 +16,8 @@ the displacement is the free run plus
   so averaging over time does not reduce it.
 
 A Kalman filter follows o, d and m by the means of groups of samples.  `estimate` is the free run
-plus offset and creep, without m: the error of the model must stay visible.  Its claimed variance
-contains the mean square of m over the last few strokes of the voltage.
+plus offset, creep and followed gain, without m: the error of the model must stay visible.  The
+claimed variance contains the mean square of m over the last few strokes of the voltage.
 
 The gain is followed on request.  A changed gain adds gamma x, with the free run x about the zero
 of the model and a random walk gamma.  Only motion distinguishes a gain from an offset.  The
@@ -27,16 +27,16 @@ accepted once the voltage has moved and the refused measurements are proportiona
 
 The drift of the gain is followed on request, too.  The gain gamma then also grows by delta a
 second, where delta is a random walk that returns to zero.  The estimate follows a ramp of the gain
-without a lag.  While the sensor is silent, however, the drift goes on and the error grows.
+without a lag.  While the sensor is silent, the drift goes on until it fades, and the error grows.
 
 Two hypotheses run side by side, weighted by their likelihood: the zero is unchanged, or it is
-anywhere.  Slow creep and a shifted zero look alike at first.  A wide prior of the zero alone would
+anywhere.  Slow creep and a shifted zero look alike at first: a wide prior of the zero alone would
 take all creep for a shift.
 
 The unknown output of a play lies between bounds, which the voltage draws together; see
-`MemoryBounds`.  The contribution of these plays is part of the offset, which may change by as much
-as their band shrinks, once G has passed the change on.  At the start G still moves by what came
-before, so the offset stays open until G has settled.
+`MemoryBounds`.  Such plays count as offset.  The offset may change by as much as their band
+shrinks, once G has passed the change on.  At the start G still answers earlier motion, so the
+offset is free until G has settled.
 
 Kalman filter: R. E. Kalman, "A new approach to linear filtering and prediction problems", J. Basic
 Engineering 82(1), 1960, doi:10.1115/1.3662552.  Weights of hypotheses: D. T. Magill, "Optimal
