@@ -73,7 +73,7 @@ class DiagnosisSession:
         """
         Begin a session; return a message about its first step.
 
-        PiezoIdentError if the model is missing, or if later data and excitation are.
+        PiezoIdentError without a model, or without both later data and an excitation.
         """
         self.drop()
         if self.model is None:
