@@ -6,8 +6,8 @@ Feedforward node: makes the voltage that moves the stage along `reference`.
 
 ``~/start`` takes the right to drive.  The node then answers each block of `reference` by a block
 of `voltage`.  The voltage has its own clock from zero, and belongs to the reference `preview`
-seconds before.  The node joins the reference from rest along a raised cosine.  When the reference
-is silent for `silence`, the node plays its remaining part and ramps to rest.  ``~/stop``, SIGINT
+seconds before.  The node joins the reference from rest along a raised cosine.  When no block comes
+for `silence`, the node plays the rest of the reference and ramps to rest.  ``~/stop``, SIGINT
 and SIGTERM ramp at once, as in the excitation.  The voltage always keeps its limits and `slew`.
 
 ``~/learn`` repeats the last reference, and corrects the voltage by the measured error, until the

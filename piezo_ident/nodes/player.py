@@ -4,13 +4,13 @@
 """
 Player node: replays a bag onto topics with the recorded spacing, or a multiple of it.
 
-A replayed message equals the recorded message bit by bit, with its own t, at any `rate`.  The log
-times give order and spacing, on a schedule that counts from its start.  If the clock of the log
-times was set back, the messages keep the order of the file.
+A replayed message equals the recorded message bit by bit, also in its t, at any `rate`.  The log
+times give order and spacing, counted from the start of the replay.  If the clock of the log times
+was set back, the messages keep the order of the file.
 
-``~/start`` opens the bag and creates a publisher for each of `topics`.  The replay begins when
-every topic has `subscribers` subscribers.  A late listener does not hold up the replay; each
-listener reports its losses.
+``~/start`` opens the bag and creates a publisher for each of `topics`, also beside other
+publishers.  The replay begins when every topic has `subscribers` subscribers.  A late listener
+does not hold up the replay; each listener reports its losses.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ The executor would take 0.3 ms for each message.  From ``~/start`` to ``~/stop``
 therefore empties the subscriptions every `POLL` and writes the bag.  The log time of a message is
 the time at which the middleware received the message, independent of thread and disk.
 
-The recorder subscribes to the topics of the graph before they have a publisher.  It subscribes to
+The recorder subscribes to topics of samples, model and report before they have a publisher, and to
 any other topic once a publisher gives the type.  A subscription requests the QoS that all
 publishers of its topic offer.
 

@@ -34,8 +34,8 @@ a ramp | |
 | limits or rest that are moved in silence | ramp to rest, back into the limits at the slew | |
 | no block for `silence` | ramp to rest in real time, on `applied_voltage` as `ramp:silence`, t \
 going on; what comes next is a new stream | WARN, unless it was at rest |
-| a second publisher | its blocks are refused until the stream of the first has ended: silent, \
-and its publisher gone or the stage at rest | WARN |
+| a second publisher | its blocks are refused until the first publisher is silent, and either has \
+gone or has left the stage at rest | WARN |
 
 `piezo_ident.live.sample_clock` distinguishes publishers.  A loss of blocks beside a second
 publisher ends the stream, because either publisher may have sent the block after the loss.
