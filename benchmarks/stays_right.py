@@ -109,8 +109,8 @@ The error of a wrong gain or loop is never much larger than its rms: nearly all 
 
 {claims}
 
-By default a gain, loop or mode that changed stays an error: the node then advises to identify
-again, to follow the gain, or to adapt. No way follows a load. Amid strong creep of earlier
+By default a gain, loop or mode that changed stays an error: the node then says what changed, and
+advises to identify again, or to diagnose. No way follows a load. Amid strong creep of earlier
 motion the adaptation first takes creep for gain, and errs more than the observer alone.
 """
 

@@ -34,7 +34,6 @@ class Driver(LabNode):
     """Publishes what the amplifier got and what the stage did, block by block."""
 
     executable = 'stage'  # whose name, parameters and config/stage.yaml it takes over
-    drives = True  # so it is at rest before any other node of its process ends
 
     def __init__(self) -> None:
         super().__init__()
@@ -64,7 +63,7 @@ class Driver(LabNode):
     def _on_block(self, message: Float64MultiArray, info: dict) -> None:
         number = info.get('publication_sequence_number')
         try:
-            samples = from_message(message)
+            samples = from_message(message, 'voltage')
         except DataError as error:
             self.sample_clock.skip(number)
             return self.report_status('running', 0.0, f'refused: {error}', WARN)

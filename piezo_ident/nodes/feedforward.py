@@ -354,7 +354,7 @@ class FeedforwardNode(DrivingNode):
         errors, brief = {t: f'{x:.3g}' for t, x in self._errors.percents.items()}, ''
         if errors:
             values |= {f'tracking_percent{tail}': error for tail, error in errors.items()}
-            brief = f'{" and ".join(errors.values())} % of stroke, tracking error; {text}'
+            brief = f'{" and ".join(errors.values())} % of the span, tracking error; {text}'
         self.report_status(
             self._state, progress, text, level, brief=brief, problems=problems, **values
         )

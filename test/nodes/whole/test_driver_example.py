@@ -140,6 +140,17 @@ def test_a_second_publisher_is_refused(lab, begin):
     assert lab.handle('excitation').stop() == 0
 
 
+def test_a_block_of_another_quantity_is_no_voltage(lab, begin):
+    lab.publish('voltage', Samples(np.arange(100) / FS, np.full(100, 9.0), 'hold', 'displacement'))
+    lab.wait(
+        lambda: any(
+            "of 'displacement', expected is voltage" in s['text'] for s in lab.statuses('stage')
+        ),
+        'refusal',
+    )
+    assert len(lab.collect('displacement')) == begin['displacement']
+
+
 def test_silence_and_what_comes_after_it(lab, begin):
     applied, y = lab.collect('applied_voltage'), lab.collect('displacement')
     # up by a ramp, too high, and then nothing more
