@@ -150,6 +150,7 @@ def test_pages_quote_what_is_made_elsewhere():
 bands: in {min(white)} to {max(white)} % of the draws of white noise
 bands: in {min(pink)} to {max(pink)} % of 1/f noise
 diagnosis: {draw_of('diagnosis_study_foreign_2')}
+diagnosis: {draw_of('diagnosis_study_foreign_3')}
 diagnosis: {draw_of('diagnosis_study_2')}
 diagnosis: is {criteria.BEYOND_CHANCE} times the largest on circularly shifted residuals
 diagnosis: within {criteria.ALIKE} times of it
