@@ -133,7 +133,7 @@ stays-right: .venv/.demo
 	.venv/bin/python benchmarks/stays_right.py docs/stays_right.md \
 	    --picture docs/images/stays_right.png
 
-# Table I of the paper with a third row: about a minute
+# Table I of the paper with a third row: some minutes
 table-one: .venv/.demo
 	.venv/bin/python benchmarks/table_one.py docs/table_one.md
 
