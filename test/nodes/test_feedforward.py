@@ -129,8 +129,10 @@ def test_without_a_model_it_does_not_start():
 def test_the_stage_goes_where_it_is_told(lab):
     topics = ('voltage', 'tracking_error', 'displacement')
     voltage, errors, answers = (lab.collect(topic) for topic in topics)
-    armed(lab)
+    rested(lab)
     first, since, begin = (len(blocks) for blocks in (voltage, errors, answers))
+    started(lab)
+    assert len(voltage) == first
     x = reference()
     sent(lab, x)
     over(lab)
