@@ -131,6 +131,18 @@ def starting():
     return client, node
 
 
+def started_again(client, starter):
+    """Start another program, whose start is not answered either, and return its future."""
+    before = set(starter.waited_for)
+    starter.dropped = 2
+    client.start('another program', 20.0, lambda reason: None)
+    for _ in range(4):
+        client.poll()
+    assert client.is_starting
+    (new,) = starter.waited_for - before
+    return new
+
+
 def hear(client, state):
     client._hear(DiagnosticStatus(values=[KeyValue(key='state', value=state)]))
 
@@ -198,12 +210,7 @@ def test_a_late_answer_to_an_earlier_start_stops_no_newer_run(is_new_accepted, a
     setter, _, starter, stopper = node.clients
     client.stop()
     (earlier,) = starter.waited_for
-    starter.dropped = 2
-    client.start('another program', 20.0, lambda reason: None)
-    for _ in range(4):
-        client.poll()
-    assert client.is_starting
-    (new,) = starter.waited_for - {earlier}
+    new = started_again(client, starter)
     if answer == 'before':
         earlier.set_result(Trigger.Response(success=True))
         # the answer to the newer start is not known yet
@@ -225,13 +232,8 @@ def test_two_starts_that_were_cancelled_before_their_answers():
     _, _, starter, stopper = node.clients
     client.stop()
     (earlier,) = starter.waited_for
-    starter.dropped = 2
-    client.start('another program', 20.0, lambda reason: None)
-    for _ in range(4):
-        client.poll()
-    assert client.is_starting
+    newer = started_again(client, starter)
     client.stop()
-    (newer,) = starter.waited_for - {earlier}
     # the excitation plays the first program, and so refuses the second
     earlier.set_result(Trigger.Response(success=True))
     newer.set_result(Trigger.Response(success=False, message='a program plays'))
