@@ -52,7 +52,6 @@ diagnose_module = importlib.import_module('piezo_ident.diagnosis.diagnose')
 EVERY = 10
 RATE = TRUTH_RATE / EVERY
 ONLY_CREEP = DiagnosisSettings(effects=('creep',))
-ONLY_HUM = DiagnosisSettings(effects=('periodic_disturbance',))
 
 
 def record_of(v, y, segments, name, channels=None, rate=RATE) -> Record:
@@ -108,10 +107,6 @@ def plain(seed=1, every=EVERY):
 
 #: a search among a few candidates takes seconds
 FEW = DiagnosisSettings(effects=('creep', 'thermal_drift', 'periodic_disturbance'))
-#: what creep is taken for most easily; test_earlier_motion tries all candidates on it
-LIKE_CREEP = DiagnosisSettings(
-    effects=('creep', 'thermal_drift', 'gain_drift', 'rate_dependent_hysteresis')
-)
 
 
 @cache
@@ -136,7 +131,7 @@ def unseen_errors(result, record) -> tuple[float, float]:
 
 def test_effect_of_the_catalogue_is_named_and_added():
     *_, unseen = measured('creep', 0.3, 1)
-    result = diagnosed('creep', 0.3, 1, LIKE_CREEP)
+    result = diagnosed('creep', 0.3, 1)
     assert result.verdict in ('named', 'class'), result.sentence
     assert 'creep' in {e.name for e in result.effects} | set(
         result.group.names if result.group else ()
@@ -476,7 +471,8 @@ def test_a_refit_of_h_is_kept_beside_hum():
     h = model.hysteresis
     other = replace(h, thresholds=h.thresholds**0.7, weights=1.1 * h.weights)
     off = replace(model, hysteresis=other)
-    result = diagnose(off, record, ONLY_HUM)
+    few = DiagnosisSettings(effects=('periodic_disturbance',))
+    result = diagnose(off, record, few)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert not any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     before, after = unseen_errors(result, unseen)
@@ -486,7 +482,7 @@ def test_a_refit_of_h_is_kept_beside_hum():
 
 def test_hum_stays_in_its_record():
     *_, unseen = measured('periodic_disturbance', 0.3, 1, every=1)
-    result = diagnosed('periodic_disturbance', 0.3, 1, ONLY_HUM, every=1)
+    result = diagnosed('periodic_disturbance', 0.3, 1, FEW, every=1)
     assert any(re.match('periodic_disturbance .*hysteresis', w) for w in result.warnings)
     assert [e.name for e in result.effects] == ['periodic_disturbance'], result.sentence
     assert result.after.overall < result.refit.overall / 3

@@ -94,7 +94,7 @@ def test_a_drift_that_no_creep_leaves_is_a_drift():
     """A stage at the lowest voltage sinks after earlier motion; this one rises, and by more."""
     drift = {'amplitude': 0.02, 'time_constant': 2.0}
     record = played(with_effects(creep=CREEP, thermal_drift=drift), 'drift')
-    result = diagnose(slow_model(), record, DiagnosisSettings(effects=('creep', 'thermal_drift')))
+    result = diagnose(slow_model(), record, FEW)
     assert [e.name for e in result.effects] == ['creep', 'thermal_drift']
     assert not any(STILL in w for w in result.warnings)
     assert unseen(result.model) < 0.03

@@ -4,7 +4,7 @@
 """A small effect beside a large one, which moves the hysteresis by more than the small one is."""
 
 from diagnosis_examples import played, with_effects
-from piezo_ident import diagnose, DiagnosisSettings
+from piezo_ident import diagnose
 from programs import slow_model
 
 EFFECTS = {
@@ -13,13 +13,8 @@ EFFECTS = {
 }
 
 
-#: all that goes with time or speed, as both of them do
-RIVALS = ('gain_drift', 'thermal_drift', 'amplifier_lag', 'backlash')
-
-
 def test_both_are_named():
-    few = DiagnosisSettings(effects=(*EFFECTS, *RIVALS))
-    result = diagnose(slow_model(), played(with_effects(**EFFECTS), 'both'), few)
+    result = diagnose(slow_model(), played(with_effects(**EFFECTS), 'both'))
     assert result.verdict == 'named'
     shares = {effect.name: effect.share for effect in result.effects}
     assert shares.keys() == EFFECTS.keys()
