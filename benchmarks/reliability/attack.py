@@ -390,7 +390,7 @@ def start(g: Any, nodes: Mapping[str, Mapping[str, Any]]) -> Attack:
     g.wait(attack.model.get_subscription_count, 'listeners to model')
     for node in nodes:
         # who does not know a publisher yet hears nothing of it
-        g._known_to(node)
+        g.known_to(node)
     return attack
 
 

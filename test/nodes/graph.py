@@ -235,7 +235,7 @@ class Graph(Observer):
         client = AsyncParameterClient(self.node, f'/{node}')
         self.wait(client.services_are_ready, f'the parameters of {node}')
         # a server drops the answer to one of whom it does not know
-        self._known_to(node)
+        self.known_to(node)
         future = client.load_parameter_file(str(path))
         self.wait(future.done, 'the answer')
         results = zip(values, future.result().results, strict=True)
@@ -260,4 +260,4 @@ class Graph(Observer):
                 lambda h=handle: h.has_spoken, f'{handle.name} to speak', meanwhile=meanwhile
             )
         for handle in handles:
-            self._known_to(handle.name, meanwhile)
+            self.known_to(handle.name, meanwhile)

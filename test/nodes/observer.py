@@ -73,7 +73,7 @@ class Observer:
         self._broken: Exception | None = None
         self._end = threading.Event()
 
-    def _known_to(self, name: str, meanwhile: Callable[[], None] = lambda: None) -> None:
+    def known_to(self, name: str, meanwhile: Callable[[], None] = lambda: None) -> None:
         """
         Wait until a node knows of all readers and writers of the observer.
 
@@ -220,7 +220,7 @@ class Observer:
         )
         for name in found():
             if name in self._statuses:
-                self._known_to(name)
+                self.known_to(name)
 
     def wait(
         self,
@@ -284,7 +284,7 @@ class Observer:
         node = service.strip('/').rpartition('/')[0]
         if is_new and node in self._statuses:
             # a server drops the answer to one of whom it does not know
-            self._known_to(node)
+            self.known_to(node)
         return self._clients[service]
 
     def _ask(self, kind: Any, service: str, request: Any, timeout: float) -> Any:

@@ -194,7 +194,7 @@ def test_an_answer_waits_for_who_is_slow_to_take_it(attack):
         g.wait(client.service_is_ready, 'the service')
         # made after the client: when this one is known, so is that
         g.client(Trigger, 'recorder/stop')
-        g._known_to('recorder')
+        g.known_to('recorder')
         answer = client.call_async(Trigger.Request())
         # everybody's answers come to all who ask
         for _ in range(50):

@@ -156,7 +156,7 @@ def test_blocks_of_a_second_publisher_change_nothing(rig):
         g.wait(lambda: second.get_subscription_count() == 3, 'the second publisher to be heard')
         # a reader that does not know it yet hears nothing of it
         for node in ('stage', 'identifier', 'model'):
-            g._known_to(node)
+            g.known_to(node)
         g.wait(lambda: g.diagnostics('stage').get('publishers') == '2', 'two publishers')
         before = int(g.diagnostics('stage')['refused_second'])
         # of another program: earlier, at the same time, and far ahead
