@@ -83,7 +83,6 @@ class RunningGraph:
         self.folder = folder
         #: last diagnostics of each node
         self.diagnostics: dict[str, dict[str, str]] = {}
-        self.codes: dict[str, int] = {}
         self._stack = contextlib.ExitStack()
         self.nodes = self._stack.enter_context(Nodes(folder / 'log'))
         self.client = self._stack.enter_context(Client('observer'))
@@ -107,10 +106,14 @@ class RunningGraph:
             self.client.wait(lambda name=name: self.state(name), PATIENCE, name)
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.observer.close()
-        self.codes = self.nodes.stop()
+        codes = self.nodes.stop()
         self._stack.close()
+        logs = {name: self.nodes.log / f'{name}.log' for name, code in codes.items() if code}
+        if logs and kind is None:
+            said = '\n'.join(f'{name}: {path.read_text()[-3000:]}' for name, path in logs.items())
+            raise PiezoIdentError(f'not ended cleanly: {codes}\n{said}')
 
     def ask(self, service: str) -> str:
         """Call a service that must not refuse, and return its answer."""

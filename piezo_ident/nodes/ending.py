@@ -11,13 +11,16 @@ this module hears a signal at once, leaves the process the time `patience` to cl
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
+import faulthandler
 import os
 import signal
 import sys
 import threading
 import time
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+#: time after the patience for a call that keeps the interpreter from all threads, as if hung [s]
+KEPT = 0.7
 
 
 class Ending:
@@ -34,28 +37,28 @@ class Ending:
         self.patience = 0.0
         self.on_wanted: Callable[[], object] = _nothing
         self.unfinished = ''
-        self._is_listening = False
 
     def listen(self) -> None:
         """Take over the two signals; only the main thread may call this."""
-        if self._is_listening:
+        if signal.getsignal(signal.SIGINT) is _nothing:
             return
-        self._is_listening = True
         heard, told = os.pipe()
         os.set_blocking(told, False)
         # the handler in C writes to it at once
         signal.set_wakeup_fd(told, warn_on_full_buffer=False)
-        for number in SIGNALS:
+        for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, _nothing)
         threading.Thread(target=self._watch, args=(heard,), name='signals', daemon=True).start()
 
     def _watch(self, heard: int) -> None:
         os.read(heard, 1)
         begin = time.monotonic()
+        faulthandler.dump_traceback_later(self.patience + KEPT, exit=True)
         self.is_wanted.set()
         self.on_wanted()
         while (left := begin + self.patience - time.monotonic()) > 0.0:
             # the patience may change meanwhile
+            faulthandler.dump_traceback_later(left + KEPT, exit=True)
             time.sleep(min(left, 0.05))
         if self.unfinished:
             sys.stderr.write(f'piezo_ident: error: ended before {self.unfinished}\n')
@@ -70,10 +73,8 @@ class Ending:
         """
         for stream in (sys.stdout, sys.stderr):
             # the stream may be closed, or its disk full
-            try:
+            with contextlib.suppress(AttributeError, OSError, ValueError):
                 stream.flush()
-            except (AttributeError, OSError, ValueError):
-                pass
         os._exit(code)
 
 

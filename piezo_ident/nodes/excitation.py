@@ -277,8 +277,7 @@ class ExcitationNode(LabNode):
         playing.tick += n
         playing.voltages, playing.segment = [float(v[-1]) for v in voltages], label
         # the first axis last: readers wait but a moment for the others, and for the first any time
-        rows = reversed([*zip(self._tails, self._outputs, voltages, strict=True)])
-        for tail, output, v in rows:
+        for tail, output, v in reversed([*zip(self._tails, self._outputs, voltages, strict=True)]):
             output.send(Samples(t, v * self._scale, label, f'{self._quantity}{tail}'))
         playing.work = time.perf_counter() - begin
 
