@@ -150,16 +150,6 @@ def false_names(row: Row) -> tuple[str, ...]:
     return tuple(n for n in row.effects if n not in row.truth and n not in held)
 
 
-def lasting(row: Row) -> bool:
-    """Return whether no refit of plays would hide what counts."""
-    return all(n in ADDED or row.left[n] >= row.misfit for n in counted(row))
-
-
-def is_lacked(row: Row) -> bool:
-    """Return whether the model errs by half the mean square of what counts: it holds the rest."""
-    return all(n in ADDED or row.before**2 >= 0.5 * row.truth[n] ** 2 for n in counted(row))
-
-
 def follows_path(row: Row) -> bool:
     """Return whether something that counts follows the path of the voltage: a wide H is one."""
     return any(find_effect(name).rate_independent for name in counted(row))
@@ -300,15 +290,6 @@ def summary(rows: Sequence[Row]) -> str:
             '- no name, not in the class of a refit',
             share(lambda r: r.verdict == 'refitted' and not r.fault and not refit_holds_it(r)),
         ],
-        [
-            '- where a refit of forty plays leaves the misfit at least',
-            found(lasting),
-        ],
-        [
-            '- where the model as identified errs by half its mean square at least',
-            found(is_lacked),
-        ],
-        ['- where both hold', found(lambda r: lasting(r) and is_lacked(r))],
         ['an effect that is no candidate: a false name', some(map(false_names, strangers))],
         ['a smaller effect: a false name', some(map(false_names, small))],
         ['a fault of the data that is none', some(map(false_faults, sound))],
@@ -333,12 +314,6 @@ def kind_of(row: Row) -> str:
     if row.fault:
         return 'a fault of the data'
     return ('nothing', 'one effect', 'two effects')[len(row.truth)]
-
-
-def hidden(row: Row) -> str:
-    """Return the one effect that counts, or the fault."""
-    single = counted(row) if len(row.truth) == 1 and is_candidate(row) else ()
-    return row.fault or ''.join(single)
 
 
 def stage_of(row: Row) -> str:
@@ -405,7 +380,6 @@ def write(
         write_cases(page, CASE_HEADS, map(case_line, done)),
         summary(done),
         by('Hidden', kind_of, done),
-        by('Effect or fault', hidden, done),
         by('Noise' if of_sums else 'Core', stage_of, done),
     ]
     page.write_text('\n\n'.join(sections) + '\n', encoding='utf-8')
