@@ -8,7 +8,9 @@ import os
 import sys
 
 from _pytest.runner import runtestprotocol
+import processes
 
+processes.set_middleware()
 #: exit status of the tests of this process
 STATUS = [0]
 

@@ -41,7 +41,16 @@ pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 from diagnostic_msgs.msg import DiagnosticArray
 from nursery import can_copy
 from observer import ENDS, Observer
-from processes import alive, crowd, Handle, in_time, LIMIT, listens, take_domain
+from processes import (
+    alive,
+    crowd,
+    Handle,
+    in_time,
+    LIMIT,
+    listens,
+    set_middleware,
+    take_domain,
+)
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -54,7 +63,6 @@ from rclpy.signals import SignalHandlerOptions
 __all__ = ['ENDS', 'Graph', 'Handle', 'alive', 'crowd', 'in_time', 'listens']
 
 ROOT = Path(__file__).resolve().parents[2]
-PROFILE = Path(__file__).with_name('prompt_discovery.xml')
 
 
 class Graph(Observer):
@@ -67,10 +75,7 @@ class Graph(Observer):
     def __enter__(self) -> Graph:
         self.domain, self._lock = take_domain()
         self.folder = Path(tempfile.mkdtemp(prefix='piezo_ident_graph_'))
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))
-        # shared memory is locked by a node that is killed, and takes three times the processor
-        os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
+        set_middleware()
         self.environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(self.domain),

@@ -48,7 +48,6 @@ def demo(tmp_path_factory):
     domain, lock = take_domain()
     with lock, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         patch.setenv('ROS_LOG_DIR', str(out / 'log'))
         patch.syspath_prepend(str(ROOT / 'examples'))
         import demo_graph

@@ -32,7 +32,6 @@ def test_what_is_missing_is_counted():
 def test_nothing_is_lost_and_the_recording_is_cut_into_parts(tmp_path, monkeypatch):
     domain, lock = take_domain()
     monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with lock:
         # a topic keeps the 40 blocks for a node that a crowded machine lets stand for seconds
         found = soak(1.0, 0.25, 400_000, tmp_path, size=500)
