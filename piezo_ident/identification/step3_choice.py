@@ -30,7 +30,7 @@ from piezo_ident.identification.step3_hysteresis import (
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics
 from piezo_ident.operators.hysteresis import Hysteresis
-from piezo_ident.operators.hysteresis_law import HysteresisLaw, LAWS
+from piezo_ident.operators.hysteresis_law import HysteresisLaw, LawName, LAWS
 
 #: number of plays in the paper, used if the data cannot choose their number
 PAPER_COUNT = 10
@@ -66,15 +66,13 @@ def merged(hysteresis: Hysteresis) -> Array:
     """
     r, q = hysteresis.thresholds, hysteresis.weights
     alive = q > 1e-6 * max(float(q.max(initial=0.0)), 1e-12)
-    places = []
-    i = 0
+    places, i = list[float](), 0
     while i < r.size:
-        if not alive[i]:
-            i += 1
-            continue
-        pair = slice(i, i + 2 if i + 1 < r.size and alive[i + 1] else i + 1)
-        places.append(float(r[pair] @ q[pair] / q[pair].sum()))
-        i = pair.stop
+        count = int(alive[i : i + 2].sum()) if alive[i] else 0
+        pair = slice(i, i + count)
+        if count:
+            places.append(float(r[pair] @ q[pair] / q[pair].sum()))
+        i += max(count, 1)
     return np.array(places)
 
 
@@ -192,12 +190,11 @@ def choose_law(
     one speed creep looks like a lag along the path.
     `tick` is called with the share of the work done, and may raise to stop it.
     """
-    low = min(e.span[0] for e in excerpts)
-    high = max(e.span[1] for e in excerpts)
+    span = min(e.span[0] for e in excerpts), max(e.span[1] for e in excerpts)
     swing = max(e.swing for e in excerpts)
     r = even_thresholds(swing, FINE)
-    law_of = {name: HysteresisLaw(name, r, (low, high)) for name in LAWS}
-    all_terms = HysteresisLaw('any', r, (low, high))
+    law_of = {name: HysteresisLaw(name, r, span) for name in LAWS}
+    all_terms = HysteresisLaw('any', r, span)
     parts = _parts(excerpts, all_terms, dynamics, delay)
     tick(0.3)
     whole = triangular_factor(parts, parts[0].shape[1])
@@ -212,9 +209,10 @@ def choose_law(
         return Choice(None)
     losses: dict[str, Array] = {}
     for i, (name, law) in enumerate(law_of.items()):
-        coefficients = [fitted(_all_but(parts, j), law).coefficients for j in range(len(parts))]
-        both = zip(parts, coefficients, strict=True)
-        losses[name] = np.array([_left_out(R, x, law, all_terms) for R, x in both])
+        each = (fitted(_all_but(parts, j), law).coefficients for j in range(len(parts)))
+        losses[name] = np.array(
+            [_left_out(R, x, law, all_terms) for R, x in zip(parts, each, strict=True)]
+        )
         tick(0.3 + 0.7 * (i + 1) / len(LAWS))
     logs = {name: 0.5 * np.log(loss) for name, loss in losses.items()}
     errors = {name: float(np.exp(log.mean())) for name, log in logs.items()}
@@ -225,23 +223,29 @@ def choose_law(
         and fitted(whole, law_of[name]).hysteresis.lowest_slope() > 0
     ]
     for excerpt in others if better else ():
-        means = Means(excerpt.u, excerpt.x, excerpt.use, excerpt.memory)
-        [rows] = filtered_rows([means], all_terms, dynamics, delay)
-        R = triangular_factor([rows], rows.shape[1])
-        left = {
-            name: _left_out(R, fitted(whole, law_of[name]).coefficients, law_of[name], all_terms)
-            for name in ('plays', *better)
-        }
-        better = [
-            name
-            for name in better
-            if left[name]
-            <= (1.0 - LAW_GAIN if law_of[name].lags else NO_WORSE) ** 2 * left['plays']
-        ]
+        laws = {name: law_of[name] for name in ('plays', *better)}
+        fits = {name: (law, fitted(whole, law).coefficients) for name, law in laws.items()}
+        better = _kept_on_small_motion(fits, excerpt, all_terms, dynamics, delay)
     if not better:
         return Choice(None, errors)
     chosen = simplest(better, errors.__getitem__, LAWS.index, 1.0 / (1.0 - LAW_GAIN))
     return Choice(law_of[chosen], errors)
+
+
+def _kept_on_small_motion(
+    fits: Mapping[LawName, tuple[HysteresisLaw, Array]],
+    excerpt: Excerpt,
+    all_terms: HysteresisLaw,
+    dynamics: Dynamics,
+    delay: Delay,
+) -> list[LawName]:
+    """List the laws, fitted with these coefficients, that small motion does not reject."""
+    means = Means(excerpt.u, excerpt.x, excerpt.use, excerpt.memory)
+    [rows] = filtered_rows([means], all_terms, dynamics, delay)
+    R = triangular_factor([rows], rows.shape[1])
+    left = {name: _left_out(R, x, law, all_terms) for name, (law, x) in fits.items()}
+    worst = {name: 1.0 - LAW_GAIN if law.lags else NO_WORSE for name, (law, _) in fits.items()}
+    return [n for n in fits if n != 'plays' and left[n] <= worst[n] ** 2 * left['plays']]
 
 
 def _upper(difference: Array) -> float:
