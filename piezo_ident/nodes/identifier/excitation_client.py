@@ -33,8 +33,8 @@ Ended = Callable[[str | None], None]
 _RESTING = ('idle', 'done', 'failed', 'stopped', 'cancelled', '')
 #: state until the first status after ``~/start`` was called
 _UNHEARD = 'unheard'
-#: longest wait for the last blocks after the status done [s]
-_TAIL = 1.0
+#: longest wait for the last blocks after the status done: a lost one is sent again within 3 s [s]
+_TAIL = 4.0
 #: longest wait for displacement while the stage warns, as when it refuses the rate [s]
 _UNANSWERED = 3.0
 #: time after which an unanswered request is sent again [s]
