@@ -152,6 +152,7 @@ bands: in {min(pink)} to {max(pink)} % of 1/f noise
 diagnosis: {draw_of('diagnosis_study_foreign_2')}
 diagnosis: {draw_of('diagnosis_study_foreign_3')}
 diagnosis: {draw_of('diagnosis_study_2')}
+diagnosis: {draw_of('diagnosis_study_3')}
 diagnosis: is {criteria.BEYOND_CHANCE} times the largest on circularly shifted residuals
 diagnosis: within {criteria.ALIKE} times of it
 diagnosis: less than {criteria.RIVALS} times as much
