@@ -184,10 +184,6 @@ class LabNode(ParameterNode):
         _report(self, error, 'its work ends')
         return repr(error)
 
-    def await_listeners(self) -> None:
-        """Wait a moment until all listeners have the last status."""
-        self._status.wait_for_all_acked(Duration(seconds=0.1))
-
     def introduce(self) -> None:
         """Log the version, the parameters that differ from their defaults, and unknown ones."""
         changed = {
@@ -249,11 +245,12 @@ def run(make: Callable[[], LabNode]) -> int:
             try:
                 node.journal.tell('ends')
                 node.close()
-                node.await_listeners()
+                node._status.wait_for_all_acked(Duration(seconds=0.1))
             except Exception as error:  # noqa: BLE001
                 _report(node, error, 'it ends all the same')
                 code = code or 1
             ENDING.unfinished = ''
+            ENDING.leave_within_last(code)
             executor.remove_node(node)
             node.destroy_node()
         executor.shutdown(timeout_sec=0.5)

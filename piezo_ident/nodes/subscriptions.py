@@ -40,12 +40,6 @@ class _NotSpun(CallbackGroup):
     def can_execute(self, entity: Any) -> bool:
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        pass
-
 
 def between_turns(node: Node, work: Callable[[], None]) -> None:
     """
