@@ -84,7 +84,9 @@ def rest_at(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool
     near = max(SHORT, tolerance(model, y) / abs(s.Y))
     if (below > near or above < -near) and not (clip and max(below, -above) < FAR):
         ends = sorted(1e6 * float(s.y(x0 + d)) for d in (below, above))
-        is_far, missed = max(below, -above) > FAR, s.Y * (below if below > 0.0 else above)
+        is_far, um = max(below, -above) > FAR, 1e6 * y
+        # the whole motion, not its start alone, has to come within reach
+        missed = 1e-6 * (ends[0] - um.min() if um[0] < ends[0] else ends[1] - um.max())
         raise DataError(
             f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
             f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'

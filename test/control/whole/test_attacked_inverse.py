@@ -44,6 +44,7 @@ def circle(radius, angle):
         (np.where(T > 0.1, np.nan, SINE), {}, '1999 bad'),
         (np.ma.masked_greater(SINE, 50e-6), {}, r'\d+ bad'),
         (-SINE, {}, 'starts at -15 um; between 0 and 10 V the stage rests at 0 .. 71'),
+        (-SINE, {}, 'raise the motion by 55 um'),
         (SINE, {'sample_rate': 1e4}, 'sampled at 10000 Hz, the model at 20000 Hz'),
         (SINE, {'limits': (-np.inf, np.inf)}, r'limits \(-inf, inf\)'),
         (SINE, {'limits': 10.0}, 'limits 10.0'),
