@@ -174,8 +174,11 @@ def _guessed(
 
 def _may_be_axes(names: Sequence[str]) -> bool:
     """Return whether several columns may be a voltage, and several a displacement."""
-    # v_y is a voltage, though its words name a displacement too
-    roles = [role_of(name_and_unit(name)[0]) for name in names]
+    # v_y is a voltage, though its words name a displacement too; a unit tells for X and Y
+    roles = [
+        role_of(base) or next((role for role in 'vy' if unit in UNITS[role]), '')
+        for base, unit in map(name_and_unit, names)
+    ]
     columns = [(i, name) for i, name in enumerate(names) if not roles[i]]
     return all(roles.count(role) + len(_fitting(role, columns)) > 1 for role in 'vy')
 

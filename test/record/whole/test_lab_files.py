@@ -217,6 +217,7 @@ def test_the_file_is_read_without_editing(tmp_path, capsys, name):
         ('time,U,U,pos', ['2 columns may be the voltage (U, U)', '--columns v=2 or', 'v=3']),
         ('t,v_x,v_y,y_x,y_y', ['--columns y=y_x or --columns y=y_y; for two axes', 'v_b and y_b']),
         ('t,drive_1,drive_2,pos_1,pos_2', ['v=drive_2; for two axes name all columns']),
+        ('t,Vx [V],X [um],Vy [V],Y [um]', ["'v=Vy [V]'; for two axes name all columns"]),
         ('t,v,y_x,y_y', ['2 columns may be the displacement', '--columns y=y_x or']),
         ('t,v,y,v', ['column v stands there twice', '--columns v=2']),
         ('time,voltage,ai0,ai1', ['y missing', '--columns y=ai0']),
