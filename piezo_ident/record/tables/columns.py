@@ -35,8 +35,8 @@ _WORDS = {
 #: names, letters only, of the sampling rate or the sampling period beside the columns
 _RATES = r'fs|rate|(sampl(e|ing)|scan)(rate|frequency)|samplesper(s|sec|second)'
 _PERIODS = (
-    r'd[tx]|ts|delta[tx]|(sampl(e|ing)|scan)(time|interval|period)|(wf|t|x|time)?incr?(ement)?|'
-    r'timestep|hresolution'
+    r'd[tx]|ts|delta[tx]|(sampl(e|ing)|scan)(time|interval|period)|tinterval|'
+    r'(wf|t|x|time)?incr?(ement)?|timestep|hresolution'
 )
 #: names of numbers that are likely a rate, or a period
 _LIKELY = (

@@ -661,6 +661,7 @@ def test_columns_by_the_fields_of_matlab_structs(tmp_path):
         ('Sampling rate,5000,5000\nCH1 (V),CH2 (um),', ''),
         ('Sample rate (kS/s): 5\nCH1 (V),CH2 (um)', ','),
         ('HResolution,2.0e-04\nCH1 (V),CH2 (um)', ''),
+        ('Tinterval,2.0e-04\nCH1 (V),CH2 (um)', ''),
     ],
 )
 def test_a_sample_time_above_the_table(tmp_path, head, end):
