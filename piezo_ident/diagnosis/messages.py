@@ -193,7 +193,9 @@ def _outcome(result: Diagnosis) -> str:
             what = 'with that gain' if result.gain else 'after a refit of the hysteresis'
             return f'{what} {fall}'
         is_larger = not result.set_in and refit < 0.5 * before
-        return f'{fall}, with a refit alone to {refit:.3g} %' if is_larger else fall
+        # the refined model is judged on other motion, and may err more than the refit
+        easier = ' of blocks between those fitted' if refit < after else ''
+        return f'{fall}, with a refit alone to {refit:.3g} %{easier}' if is_larger else fall
     if before > np.hypot(refit, SMALLEST_EFFECT):
         return (
             f'a refit of the hysteresis leaves {refit:.3g} % of blocks between those fitted, but '

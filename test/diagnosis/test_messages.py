@@ -8,12 +8,14 @@ import json
 import re
 
 from command_line import succeed
+from diagnosis_examples import example
 import jsonschema
 from measured_data import measured_record
 import numpy as np
 import piezo_ident as pi
 from piezo_ident.cli import diagnose_command
 from piezo_ident.control.hysteresis_inverse import rising
+from piezo_ident.diagnosis.messages import sentence
 from piezo_ident.excitation.program import parse_program
 from piezo_ident.model.files import load
 from piezo_ident.model.stage_model import EffectSetting
@@ -58,6 +60,13 @@ def vibration(size):
 def bent(x, t):
     """Return a motion with other loops."""
     return x * (1.05 - 0.05 * x)
+
+
+def test_a_refit_that_errs_less_than_the_refined_model_names_its_data():
+    named = example('named')
+    refit = replace(named.refit, overall=0.5 * named.after.overall)
+    said = f'with a refit alone to {refit.overall:.3g} % of blocks between those fitted'
+    assert said in sentence(replace(named, refit=refit))
 
 
 def narrow_model():
