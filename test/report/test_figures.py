@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 import numpy as np
 import piezo_ident as pi
-from piezo_ident.model.free_run import piece_runs
+from piezo_ident.model.free_run import piece_runs, PieceRun
 from piezo_ident.model.sines import sines_of
 from piezo_ident.operators.dynamics import Dynamics
 from piezo_ident.record.record import Piece, Segment
@@ -79,6 +79,13 @@ def test_overview_shows_measurement_and_model_and_sines_are_those_of_the_result(
     lines = lines_of(sines_figure(errors))
     expected = [(e.frequency, e.percent) for e in errors]
     assert np.allclose(lines['model with dynamics'], expected)
+
+
+def test_a_band_of_an_unknown_start_leaves_the_error_readable():
+    y = 1e-5 * np.sin(np.linspace(0.0, 30.0, 900))
+    run = PieceRun('r', Piece(1e6 * y, y, 1000.0), y + 1e-8, y + 1e-8)
+    half = np.geomspace(1e-4, 2e-8, y.size)
+    assert overview_figure(run, half_width=half).axes[2].get_ylim()[1] < 150.0
 
 
 def test_bars_are_the_errors_of_the_diagnosis():

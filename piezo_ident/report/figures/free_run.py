@@ -152,7 +152,10 @@ def _draw_band(axes: Axes, t: Array, half: Array) -> None:
     for sign, name in ((1.0, 'band'), (-1.0, '')):
         style.line(axes, t, sign * half, COLOURS['static'], name, linewidth=0.8)
     if known.size:
-        style.symmetric(axes, max(axes.get_ylim()[1], 1.1 * float(np.quantile(known, 0.95))))
+        error = axes.get_ylim()[1]
+        # a band of an unknown start may be hundreds of times the error, which stays readable
+        most = READABLE * max(error, float(known.min()))
+        style.symmetric(axes, max(error, min(most, 1.1 * float(np.quantile(known, 0.95)))))
 
 
 def _name_segments(axes: Axes, run: PieceRun) -> None:
