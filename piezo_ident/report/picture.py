@@ -202,7 +202,7 @@ def _free_run(result: FreeRun) -> tuple[str, Table]:
         counts = f'NRMSE fit {number(e.fit, 4)} %, {e.n} samples'
         rows.append((name, f'{number(e.percent)} % of stroke, {counts}'))
         if e.mostly_offset:
-            zero = ': the sensor was set to zero elsewhere' if e.only_offset else ''
+            zero = ': as if the sensor were zeroed elsewhere' if e.only_offset else ''
             left = f'{number(e.percent_without_offset)} % after removing a mean of'
             rows.append(('', f'{left} {length(e.offset)}{zero}'))
     if (seen := result.errors_of_estimate) is not None:

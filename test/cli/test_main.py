@@ -251,7 +251,7 @@ def test_predict_warns_outside_the_identified_range(predicted):
 
 def test_predict_tells_an_offset_from_a_bad_model(predicted, sine):
     text, data = predicted(replace(sine, y=sine.y + 5e-6))
-    assert '% after removing a mean of 5.00' in text and 'set to zero elsewhere' in text
+    assert '% after removing a mean of 5.00' in text and 'as if the sensor were zeroed' in text
     whole = data['whole']
     assert whole['offset'] == pytest.approx(5e-6, rel=0.01)
     assert whole['percent_of_stroke'] > 5.0
