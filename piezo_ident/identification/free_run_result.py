@@ -128,7 +128,8 @@ def _memory(stage: Stage, i: int, run: Run, thresholds: Array) -> Array:
 def _hysteresis_result(fits: FreeRunFits) -> HysteresisFit:
     last, stage, law = fits.last, fits.last.stage, fits.last.stage.law
     errors: dict[str, float] = {}
-    for c in fits.candidates:
+    # creep is no merit of a law
+    for c in (c for c in fits.candidates if c.effects <= fits.best.effects):
         name = c.fit.stage.law.name
         errors[name] = min(float(np.sqrt(c.error)), errors.get(name, np.inf))
     H = _compact(stage.hysteresis)

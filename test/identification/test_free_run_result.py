@@ -67,6 +67,13 @@ def fits_of(G, delay, u):
     return FreeRunFits((Excerpt(u, u, use),), (use,), last, last, (best,), best)
 
 
+def test_creep_that_the_model_lacks_is_no_merit_of_a_law():
+    fits = fits_of(Dynamics.unit(), 0, sine(20.0))
+    creeping = RatedFit('plays, creep', fits.last, 0.25, 0.25, effects=1)
+    result = _hysteresis_result(replace(fits, candidates=(fits.best, creeping)))
+    assert result.errors_of_laws == {'plays': 1.0}
+
+
 #: a jump moves the voltage at all frequencies
 JUMP = 0.1 * (np.arange(2000) > 1000)
 MODE, LOW = (with_mode(frequency).dynamics for frequency in (700.0, 30.0))
