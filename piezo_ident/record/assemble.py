@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +24,7 @@ from piezo_ident.record.channels import role_of
 from piezo_ident.record.clock import Clock, fit_clock, Resolution, split_uniform
 from piezo_ident.record.options import ReadOptions, split_unit, unit_factor, UNITS
 from piezo_ident.record.ordering import at_times, in_order, not_uniform, OrderedRows, unrounded
-from piezo_ident.record.record import Fault, Piece, Record, Segment
+from piezo_ident.record.record import Fault, NAMED, Piece, Record, Segment
 
 #: label of each stretch, and the row at which it begins
 SegmentStarts = tuple[Sequence[str], ArrayLike]
@@ -118,8 +119,11 @@ def _table(
     columns: dict[str, Array] = {}
     if taken := {'t', 'v', 'y'} & channels.keys():
         raise DataError(f'{name}: a further channel is called {min(taken)}; give it another name')
-    for key, values in {'t': t, 'v': v, 'y': y, **channels}.items():
-        if values is not None:
+    signals: dict[Any, Any] = {'t': t, 'v': v, 'y': y, **channels}
+    if unnamed := [key for key in signals if not isinstance(key, str)]:
+        raise DataError(f'{name}: channels: {unnamed[0]!r} is no name; {NAMED}')
+    for key, values in signals.items():
+        if values is not None or key == 't':
             columns[key] = real_array(values, f'{name}: {key}')
     shapes = {k: x.shape for k, x in columns.items()}
     if len(set(shapes.values())) > 1 or columns['t'].ndim != 1:
@@ -129,18 +133,21 @@ def _table(
     if n < 2:
         content = 'one sample only' if n else 'no samples'
         raise DataError(f'{name}: {content}; a record needs at least two')
-    names, starts = segments if segments is not None else ((), ())
     try:
-        rows = np.asarray(starts if len(names) else (), dtype=np.float64).ravel()
+        names, starts = segments if segments is not None else ((), ())
+        names = tuple(names)
+        rows = np.asarray(starts if names else (), dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        rows = np.array([np.nan])
+        names, rows = (), np.array([np.nan])
     inside = np.all((rows >= 0) & (rows <= n) & (rows == np.floor(rows)))
-    if rows.size != len(names) or not inside or np.any(np.diff(rows) < 0):
+    are_texts = all(isinstance(label, str) for label in names)
+    if rows.size != len(names) or not inside or np.any(np.diff(rows) < 0) or not are_texts:
         raise DataError(
-            f'{name}: segments need one start for each name, rising sample indices from 0 to {n}'
+            f'{name}: segments need text labels and one start for each, rising sample indices '
+            f'from 0 to {n}'
         )
     empty = np.zeros(0, dtype=np.int64)
-    return OrderedRows(columns.pop('t'), columns, tuple(names), rows.astype(np.int64), empty)
+    return OrderedRows(columns.pop('t'), columns, names, rows.astype(np.int64), empty)
 
 
 def _drop_not_finite(table: OrderedRows, name: str, met: list[Fault]) -> OrderedRows:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import math
 from numbers import Real
 import re
+import reprlib
 import unicodedata
 
 from piezo_ident.common.errors import DataError, expect
@@ -88,9 +89,15 @@ class ReadOptions:
                     f'{known[-1]}, or what one of the file is, as in 10{known[-2]}'
                 )
             object.__setattr__(self, f'{quantity}_unit', unit)
-        if self.voltage_limits is not None and self.voltage_limits[0] > self.voltage_limits[1]:
-            low, high = self.voltage_limits
-            raise DataError(f'voltage limits {low:g}..{high:g} V: give the lower one first')
+        if (limits := self.voltage_limits) is not None:
+            try:
+                low, high = map(float, limits)
+            except (TypeError, ValueError, OverflowError):
+                text = reprlib.repr(limits)
+                raise DataError(f'voltage limits {text}: give two numbers, in volts') from None
+            if not low <= high:
+                raise DataError(f'voltage limits {low:g}..{high:g} V: give the lower one first')
+            object.__setattr__(self, 'voltage_limits', (low, high))
         if self.rate is not None:
             cure = 'give the samples a second, as in 20e3'
             expect(self.rate, Real, 'rate', cure)

@@ -49,11 +49,23 @@ def test_arrays_without_their_time_are_refused(arrays, rate):
         ({'sample_rate': '1000'}, 'mine: sample_rate: expected Real, got str'),
         ({'sample_rate': [RATE]}, 'mine: sample_rate: expected Real, got list'),
         ({'sample_rate': RATE, 'channels': [V]}, 'mine: channels: expected Mapping, got list'),
+        ({'sample_rate': RATE, 'channels': {1: V}}, 'mine: channels: 1 is no name'),
+        *(
+            ({'sample_rate': RATE, 'segments': segments}, 'mine: segments need text labels')
+            for segments in ((), 3.0, ('noise', 'sine', 'noise'), (None, [0]), ([1.0], [0]))
+        ),
+        *(
+            ({'sample_rate': RATE, 'voltage_limits': limits}, 'voltage limits .* two numbers')
+            for limits in ((), (0.0,), 10.0, ('low', 'high'), (None, None), V)
+        ),
+        ({'sample_rate': RATE, 'voltage_limits': (np.nan, 10.0)}, r'voltage limits nan\.\.10 V'),
     ],
 )
 def test_options_of_another_type_are_refused(wrong, line):
     with pytest.raises(DataError, match=line):
         Record.from_arrays(V, Y, name='mine', **wrong)
+    with pytest.raises(DataError, match=r'mine: columns differ in length \(t , v 2000'):
+        Record.from_arrays(None, V, Y, name='mine')
     assert Record.from_arrays(V, Y, sample_rate=np.array(RATE)).pieces[0].sample_rate == RATE
 
 
