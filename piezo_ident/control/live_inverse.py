@@ -203,7 +203,8 @@ class LiveInverse:
         Follow a voltage that another source has applied up to now.
 
         The displacement of the model under this voltage replaces the past of the wanted motion;
-        `position` is its last value.  The next `preview` samples give no voltage yet.
+        `position` is its last value.  The next `preview` samples give no voltage yet; the first
+        sample of voltage waits for the second one, whose slope the transition takes over.
 
         Parameters
         ----------
@@ -228,7 +229,7 @@ class LiveInverse:
         Returns
         -------
         Driven
-            As many samples; after `follow`, `preview` samples fewer.
+            As many samples; after `follow`, `preview` samples fewer in all.
 
         Raises
         ------
@@ -326,6 +327,8 @@ class _Pass:
         """
         x, d, w = (np.append(*z) for z in ((self._x, x), (self._d, d), (self._w, w)))
         n = max(x.size - self._ahead, 0)
+        if n == 1 and self._w0 is not None:
+            n = 0  # the transition takes over the slope between two samples
         self._x, self._d, self._w = x[n:], d[n:], w[n:]
         if n == 0:
             nothing = np.empty(0)
@@ -341,8 +344,7 @@ class _Pass:
     def _joined(self, goal: Array) -> Array:
         """Fade the step from another voltage out of the goal of H."""
         if self._w0 is not None:
-            slope = goal[1] - goal[0] if goal.size > 1 else 0.0
-            self._step, self._w0, self._since = self._w0 + slope - goal[0], None, 0
+            self._step, self._w0, self._since = self._w0 + (goal[1] - goal[0]) - goal[0], None, 0
         if self._since < JOIN:
             k = np.minimum(np.arange(self._since, self._since + goal.size) / JOIN, 1.0)
             goal = goal + self._step * (0.5 + 0.5 * np.cos(np.pi * k))

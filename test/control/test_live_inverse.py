@@ -137,6 +137,20 @@ def test_it_goes_on_behind_a_voltage_that_another_one_applied():
     assert_allclose(other.process(wanted[k - live.preview :]).v, rest, atol=2e-2)
 
 
+@pytest.mark.parametrize('size', [1, 2, 7, 401])
+def test_what_follows_another_voltage_does_not_depend_on_the_blocks(size):
+    live = LiveInverse(PAPER)
+    wanted = motion(mean=30e-6)
+    v, _ = driven(live, wanted)
+    rest, parts = wanted[2600:4000], []
+    for blocks in ([rest], np.split(rest, range(size, rest.size, size))):
+        live.reset()
+        live.follow(v[:2600])
+        parts.append(np.concatenate([live.process(block).v for block in blocks]))
+    assert parts[0].size == rest.size - live.preview
+    assert np.array_equal(*parts)
+
+
 def test_a_preview_that_is_short_is_told_and_one_without_sense_refused():
     live = LiveInverse(PAPER, preview=4)
     assert live.error > 0.1
