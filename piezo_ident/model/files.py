@@ -226,8 +226,8 @@ def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Read the terms of a hysteresis beyond plays and a cubic."""
     wide: dict[str, Any] = {'p0': number(h, 'p0', name, 0.0)}
     for key in ('curves', 'relaxations'):
-        if key not in h:
-            continue
+        if h.get(key, []) == []:
+            continue  # a sum of no plays has no curves
         rows, where = h[key] if isinstance(h[key], list) else [None], f'hysteresis.{key}'
         parsed = [numbers({where: row}, where, name) for row in rows]
         if len({row.size for row in parsed}) > 1:

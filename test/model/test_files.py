@@ -69,6 +69,7 @@ def test_save_and_load_is_exact(tmp_path):
         {'p0': 0.05},
         {'p0': 0.05, 'curves': np.full((9, 3), 0.01)},
         {'bias': np.full(9, 0.02), 'span': (0.0, 1.1)},
+        {'thresholds': [], 'weights': [], 'curves': np.zeros((0, 3)), 'bias': []},
     ],
 )
 def test_a_wide_hysteresis_survives_exactly(wide, tmp_path):
