@@ -197,7 +197,7 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
     if max(a.size, b.size) > ORDER:
         raise ModelError(f'{name}: dynamics of order {max(a.size, b.size)}; at most {ORDER}')
     try:
-        return StageModel(
+        model = StageModel(
             sample_rate=number(data, 'sample_rate', name),
             scaling=Scaling(
                 v0=number(source, 'v0', name),
@@ -220,6 +220,22 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
         )
     except ModelError as error:
         raise (error if str(error).startswith(name) else ModelError(f'{name}: {error}')) from None
+    if not _is_finite(model):
+        raise ModelError(
+            f'{name}: the displacement over the range {limits[0]:g} .. {limits[1]:g} V is not '
+            'finite; correct the largest and smallest numbers'
+        )
+    return model
+
+
+def _is_finite(model: StageModel) -> bool:
+    """Tell whether the displacements over the range are finite."""
+    with np.errstate(all='ignore'):
+        try:
+            w = model.hysteresis(model.scaling.u(np.linspace(*model.scaling.range, 3)))
+        except OverflowError:
+            return False
+        return bool(np.isfinite(model.scaling.y(model.dynamics.gain * w)).all())
 
 
 def _wide(h: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -230,3 +230,20 @@ def test_plain_data_are_plain():
     assert plain(given_) == {'a': 1.5, '1': [1, 2], 'c': [True, {'x': None}]}
     assert type(plain(given_)['c'][0]) is bool
     assert type(plain(given_)['1'][0]) is int
+
+
+@pytest.mark.parametrize(
+    ('part', 'key', 'value'),
+    [
+        ('input', 'v0', 1e300),
+        ('input', 'V', 5e-324),
+        ('hysteresis', 'span', [-1e300, 1.0]),
+        ('hysteresis', 'relaxations', [[1e-300, 0.1, 0.1, 0.1]]),
+    ],
+)
+def test_numbers_that_overflow_are_refused(part, key, value):
+    wrong = data()
+    wrong['hysteresis']['relaxations'] = [[10.0, 0.1, 0.0, 0.0]]
+    wrong[part][key] = value
+    with pytest.raises(ModelError, match=r'mine: the displacement over .* is not finite'):
+        model_from_dict(wrong, 'mine')
