@@ -321,8 +321,11 @@ class Predictor:
             self._run = run_of(model, self._axes)
         try:
             y = self._run.process(v, t)
+            if not np.isfinite(y).all():
+                raise ModelError(f'the prediction at t = {t[0]:.6g} s is not finite')
         except ModelError as error:
-            self.problem, self._run = f'{error}; the prediction begins anew', None
+            self.problem = f'{error}; the prediction begins anew'
+            self._run, self._bands = None, []
             return None
         self.felt = self._run.felt
         return y

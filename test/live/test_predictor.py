@@ -236,6 +236,20 @@ def test_a_block_with_nan_is_left_out():
     assert predictor.clock.lost == 100
 
 
+def test_a_prediction_that_overflows_is_none_and_begins_anew():
+    v = drive(3000)
+    predictor = running(model())
+    blocks = cut(v)
+    wild = Samples(blocks[5].t, np.where(np.arange(100) == 50, 1e300, blocks[5].values))
+    predicted(predictor, blocks[:5])
+    assert predictor.process(wild) is None
+    assert predictor.problem == (
+        'the prediction at t = 0.05 s is not finite; the prediction begins anew'
+    )
+    again = predicted(predictor, blocks[6:])
+    assert np.array_equal(again, predicted(running(model()), cut(v[600:])))
+
+
 def test_another_sampling_rate_is_refused():
     predictor = Predictor()
     predictor.process(cut(drive(300))[0])
