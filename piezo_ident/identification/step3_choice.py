@@ -191,8 +191,7 @@ def choose_law(
     `tick` is called with the share of the work done, and may raise to stop it.
     """
     span = min(e.span[0] for e in excerpts), max(e.span[1] for e in excerpts)
-    swing = max(e.swing for e in excerpts)
-    r = even_thresholds(swing, FINE)
+    r = even_thresholds(max(e.swing for e in excerpts), FINE)
     law_of = {name: HysteresisLaw(name, r, span) for name in LAWS}
     all_terms = HysteresisLaw('any', r, span)
     parts = _parts(excerpts, all_terms, dynamics, delay)
