@@ -47,6 +47,6 @@ def test_it_tells_what_is_cut_off_when_its_patience_is_over():
 
 @pytest.mark.parametrize('code', [0, 1])
 def test_it_ends_after_the_last_moment_though_a_call_keeps_the_interpreter(code):
-    # a function of `PyDLL` keeps the lock of the interpreter
-    work = f'ENDING.leave_within_last({code}); ctypes.PyDLL(None).sleep(100)'
+    # a function of `PyDLL` keeps the lock of the interpreter; a signal ends a sleep
+    work = f'ENDING.leave_within_last({code})\nwhile True: ctypes.PyDLL(None).sleep(100)'
     assert ended('ENDING.patience = 5.0', work) == (code, '')
