@@ -43,6 +43,11 @@ def test_arrays_without_their_time_are_refused(arrays, rate):
         Record.from_arrays(*arrays, sample_rate=rate)
 
 
+def test_a_time_that_is_none_is_refused():
+    with pytest.raises(DataError, match=r'mine: columns differ in length \(t , v 2000'):
+        Record.from_arrays(None, V, Y, name='mine')
+
+
 @pytest.mark.parametrize(
     ('wrong', 'line'),
     [
@@ -64,8 +69,6 @@ def test_arrays_without_their_time_are_refused(arrays, rate):
 def test_options_of_another_type_are_refused(wrong, line):
     with pytest.raises(DataError, match=line):
         Record.from_arrays(V, Y, name='mine', **wrong)
-    with pytest.raises(DataError, match=r'mine: columns differ in length \(t , v 2000'):
-        Record.from_arrays(None, V, Y, name='mine')
     assert Record.from_arrays(V, Y, sample_rate=np.array(RATE)).pieces[0].sample_rate == RATE
 
 
