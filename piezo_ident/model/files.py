@@ -28,6 +28,9 @@ EFFECTS, ORDER = 50, 200
 
 _REQUIRED = ('sample_rate', 'input', 'output', 'delay', 'hysteresis', 'dynamics')
 _OPTIONAL = ('schema_version', 'package_version', 'effects', 'identification')
+#: size of numbers, and of their inverse, up to which no displacement overflows: u is below its
+#: square, u^4 below its eighth power, and three more factors leave that far below 1e308
+LARGE = 1e20
 #: arrays of a hysteresis beyond plays and a cubic
 _WIDE = ('curves', 'bias', 'relaxations')
 _INSIDE: Mapping[str, tuple[str, ...]] = {
@@ -230,6 +233,11 @@ def model_from_dict(data: Mapping[str, Any], name: str = 'model') -> StageModel:
 
 def _is_finite(model: StageModel) -> bool:
     """Tell whether the displacements over the range are finite."""
+    parts = vars(model.scaling).values(), vars(model.hysteresis).values(), [model.dynamics.gain]
+    sizes = np.abs([n for part in parts for x in part if x is not None for n in np.ravel(x)])
+    # ordinary numbers do not overflow, and H would load or compile its kernels
+    if np.all((sizes == 0.0) | ((sizes > 1.0 / LARGE) & (sizes < LARGE))):
+        return True
     with np.errstate(all='ignore'):
         try:
             w = model.hysteresis(model.scaling.u(np.linspace(*model.scaling.range, 3)))
