@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import contextlib
 import ctypes
+import math
 import os
 import signal
 import struct
@@ -38,6 +39,13 @@ class Ending:
         self.patience = 0.0
         self.on_wanted: Callable[[], object] = _nothing
         self.unfinished = ''
+        self._heard = math.inf
+
+    @property
+    def left(self) -> float:
+        """Time until the end of the process [s]; before a signal, that after one."""
+        now = time.monotonic()
+        return max(0.0, min(self._heard, now) + self.patience - now)
 
     def listen(self) -> None:
         """Take over the two signals; only the main thread may call this."""
@@ -53,12 +61,12 @@ class Ending:
 
     def _watch(self, heard: int) -> None:
         os.read(heard, 1)
-        begin = time.monotonic()
+        self._heard = time.monotonic()
         self.is_wanted.set()
         self.on_wanted()
-        while (left := begin + self.patience - time.monotonic()) > 0.0:
+        while self.left:
             # the patience may change meanwhile
-            time.sleep(min(left, 0.05))
+            time.sleep(min(self.left, 0.05))
         if self.unfinished:
             sys.stderr.write(f'piezo_ident: error: ended before {self.unfinished}\n')
         self.leave(1 if self.unfinished else 0)

@@ -18,9 +18,8 @@ from typing import Any
 
 from piezo_ident.common.errors import ConfigError
 from piezo_ident.nodes.subscriptions import between_turns, unspun
-from piezo_ident.nodes.wire import publishers, STREAM, to_message, UNNAMED
+from piezo_ident.nodes.wire import await_readers, publishers, STREAM, to_message, UNNAMED
 from piezo_ident.record.blocks import Samples
-from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
@@ -174,7 +173,7 @@ class ExclusivePublisher:
         """Give the right to drive back."""
         self.stop_listening()
         if self._publisher is not None:
-            self._publisher.wait_for_all_acked(Duration(seconds=0.1))
+            await_readers(self._publisher)
             if not self._stays:
                 self._node.destroy_publisher(self._publisher)
                 self._publisher = None

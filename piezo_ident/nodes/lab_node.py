@@ -31,10 +31,9 @@ from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.journal import FromPackage, parameters_text, shortened
 from piezo_ident.nodes.parameter_node import begin, ParameterNode, unknown_to
 from piezo_ident.nodes.parameters import NODES
-from piezo_ident.nodes.wire import LATCHED, PREVIEW, SERVICE
+from piezo_ident.nodes.wire import await_readers, LATCHED, PREVIEW, SERVICE
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from std_srvs.srv import Trigger
@@ -245,7 +244,7 @@ def run(make: Callable[[], LabNode]) -> int:
             try:
                 node.journal.tell('ends')
                 node.close()
-                node._status.wait_for_all_acked(Duration(seconds=0.1))
+                await_readers(node._status)
             except Exception as error:  # noqa: BLE001
                 _report(node, error, 'it ends all the same')
                 code = code or 1

@@ -59,8 +59,7 @@ class ModelNode(LabNode):
         super().__init__(**kwargs)
         warm_up()
         self._tails = self.tails()
-        axes = [f'y{tail}' for tail in self._tails]
-        self._predictor = Predictor(axes, self.values['interval'])
+        self._predictor = Predictor([f'y{tail}' for tail in self._tails], self.values['interval'])
         self._join, self._looks = Join(self._tails[1:]), Looks()
         self._preview = Preview(self.values['preview_rate'])
         self._source, self._refusal, self._unreadable, self._not_finite = '', '', 0, 0

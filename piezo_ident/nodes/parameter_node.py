@@ -64,8 +64,7 @@ def home_problem(path: str) -> str | None:
 
 def no_parameter(node: Node, name: str) -> str:
     """Say that a node has no such parameter, and guess the intended name."""
-    known = node.list_parameters([], 0).names
-    guess = did_you_mean(name, known)
+    guess = did_you_mean(name, node.list_parameters([], 0).names)
     return f'{name} is no parameter of this node{guess and "; "}{guess}'
 
 

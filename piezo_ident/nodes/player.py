@@ -26,6 +26,7 @@ from typing import Any
 
 from piezo_ident.common.errors import DataError, PiezoIdentError
 from piezo_ident.live.pacing import Rate, Schedule, SLIP
+from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.lab_node import ERROR, LabNode, OK, WARN
 from piezo_ident.nodes.parameters import with_axes
 from piezo_ident.nodes.subscriptions import message_class, topics_problem
@@ -40,11 +41,11 @@ from piezo_ident.record.bags.read import (
 )
 from piezo_ident.record.bags.recover import Bag
 from piezo_ident.record.blocks import Samples
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rosbags.interfaces import Connection, QosDurability, QosHistory, QosReliability
 
-#: longest wait for the end of a replay when the node ends [s]
-PATIENCE = 1.0
+#: share of the time until the end of the node for the end of a replay
+PATIENCE = 0.75
 #: time between the match of the subscribers and the first message, so that both sides know it [s]
 SETTLE = 0.2
 #: time between two reports of progress [s]
@@ -79,7 +80,7 @@ class PlayerNode(LabNode):
     def __init__(self, **kwargs: Any) -> None:
         self._replay: Replay | None = None
         self._thread: threading.Thread | None = None
-        self._senders: dict[tuple[str, str, bool, bool, int], Any] = {}
+        self._senders: dict[tuple[str, str, str], Any] = {}
         self._rate = Rate()
         super().__init__(**kwargs)
         self.offer('start', self.start)
@@ -140,8 +141,7 @@ class PlayerNode(LabNode):
                 prepared = True
                 self._await_subscribers(replay, senders)
                 clock = LogClock()
-                schedule = self._send(replay, bag, senders, clock)
-                self._report_end(replay, bag, schedule, clock)
+                self._report_end(replay, bag, self._send(replay, bag, senders, clock), clock)
         except _Stopped:
             replay.is_over = True
             about = f'stopped after {replay.messages} of {replay.total} messages'
@@ -174,13 +174,7 @@ class PlayerNode(LabNode):
             if connection.topic in chosen and connection.topic not in senders:
                 target = chosen[connection.topic]
                 profile = _profile(connection)
-                key = (
-                    target,
-                    connection.msgtype,
-                    profile.reliability == ReliabilityPolicy.RELIABLE,
-                    profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-                    profile.depth,
-                )
+                key = target, connection.msgtype, str(profile)
                 # publishers are kept for the next replay, as they have met their subscribers
                 if key not in self._senders:
                     kind = message_class(connection.msgtype)
@@ -195,9 +189,8 @@ class PlayerNode(LabNode):
         need, limit = self.values['subscribers'], self.values['wait_limit']
         began = time.monotonic()
         while True:
-            few = {t: s.get_subscription_count() for t, s in senders.items()}
-            few = {t: n for t, n in few.items() if n < need}
-            if not few:
+            counts = {t: s.get_subscription_count() for t, s in senders.items()}
+            if not (few := {t: n for t, n in counts.items() if n < need}):
                 break
             lacking = ', '.join(f'{senders[t].topic_name} ({n} of {need})' for t, n in few.items())
             if time.monotonic() - began > limit:
@@ -289,7 +282,7 @@ class PlayerNode(LabNode):
         """End the replay before the node ends."""
         if self._replay is not None and self._thread is not None:
             self._replay.stop.set()
-            self._thread.join(PATIENCE)
+            self._thread.join(PATIENCE * ENDING.left)
 
 
 def chosen_topics(
@@ -312,8 +305,7 @@ def chosen_topics(
         if not matches and not name.startswith(('/', '~')):
             matches = [t for t in topics if t.endswith(f'/{name}')]
             if not matches and '/' not in name:
-                carried = _carried(bag).items()
-                matches = [t for t, q in carried if q == name and not is_computed(t)]
+                matches = [t for t, q in _carried(bag).items() if q == name and not is_computed(t)]
         if not matches:
             raise DataError(
                 f'{bag.path}: no topic {name} in it; set topics to some of: '

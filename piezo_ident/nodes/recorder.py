@@ -229,8 +229,7 @@ class RecorderNode(LabNode):
         values = {**self._numbers(), 'rate': f'{rate:.1f}'}
         if recording is not None and recording.failure:
             return ERROR, recording.failure, values
-        lost = self._lost()
-        if lost:
+        if lost := self._lost():
             return WARN, f'{lost} messages were sent and not received', values
         return OK, 'recording' if self._is_recording() else 'not recording', values
 

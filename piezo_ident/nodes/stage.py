@@ -61,9 +61,8 @@ from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.model.two_axis_stage import load_stage
 from piezo_ident.nodes.journal import RecentFaults
 from piezo_ident.nodes.lab_node import guard_settings, LabNode, OK, WARN
-from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
+from piezo_ident.nodes.wire import await_readers, from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import BLOCK_SIZE, HELD, RAMPED, Samples
-from rclpy.duration import Duration
 from std_msgs.msg import Float64MultiArray
 
 #: period of the timer that ramps a silent stage [s]
@@ -345,4 +344,4 @@ class StageNode(LabNode):
             sent += size
             time.sleep(max(0.0, begin + sent / self.sample_rate - time.monotonic()))
         for publisher in self._applied:
-            publisher.wait_for_all_acked(Duration(seconds=0.1))
+            await_readers(publisher)

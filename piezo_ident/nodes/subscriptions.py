@@ -248,8 +248,7 @@ class RawSubscriptions:
                     continue
                 for raw, info in received(topic.subscription, raw=True):
                     topic.taken += 1
-                    number = info['publication_sequence_number'] or 0
-                    topic.note(number)
+                    topic.note(info['publication_sequence_number'] or 0)
                     topic.is_followed = topic.is_single
                     arrival = info['received_timestamp'] or time.time_ns()
                     messages.append((self._clock.stamp(arrival), topic.name, raw))

@@ -8,8 +8,11 @@ from __future__ import annotations
 from array import array
 
 from piezo_ident.common.errors import DataError
+from piezo_ident.nodes.ending import ENDING
 from piezo_ident.record.blocks import decode, encode, Samples, time_problem
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
@@ -79,18 +82,22 @@ def from_message(message: Float64MultiArray, *quantities: str) -> Samples:
     return samples
 
 
+def await_readers(publisher: Publisher) -> None:
+    """Wait until the readers have the last message, for half of the time until the node ends."""
+    publisher.wait_for_all_acked(Duration(seconds=ENDING.left / 2))
+
+
 def publishers(node: Node, topic: str) -> dict[bytes, str]:
     """
     Map the gid of each publisher of a topic to the full name of its node.
 
     The middleware may discover a publisher before its node; the name is then `UNNAMED`.
     """
-    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     return {
         bytes(info.endpoint_gid): UNNAMED
         if info.node_name == '_NODE_NAME_UNKNOWN_'
         else f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-        for info in infos
+        for info in node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     }
 
 

@@ -45,6 +45,17 @@ def test_it_tells_what_is_cut_off_when_its_patience_is_over():
     assert code == 1 and 'ended before the file was closed' in said
 
 
+def test_it_knows_how_much_time_is_left():
+    # before a signal all of it; 0.3 s after one, what is left of 5 s
+    count = 'print(ENDING.left, file=sys.stderr)'
+    code, said = ended(
+        f'import sys; ENDING.patience = 5.0; {count}',
+        f'ENDING.is_wanted.wait(); time.sleep(0.3); {count}; ENDING.leave(0)',
+    )
+    before, after = map(float, said.split())
+    assert code == 0 and before == 5.0 and 0.0 < after < 4.7001
+
+
 @pytest.mark.parametrize('code', [0, 1])
 def test_it_ends_after_the_last_moment_though_a_call_keeps_the_interpreter(code):
     # a function of `PyDLL` keeps the lock of the interpreter; a signal ends a sleep

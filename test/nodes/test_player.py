@@ -4,6 +4,9 @@
 """The player on a running graph: what comes out is what was recorded, when it was recorded."""
 
 from pathlib import Path
+import threading
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy cannot be imported: no ROS here')
 
 from graph import Graph, in_time
+from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.player import PlayerNode, Replay
 from piezo_ident.nodes.wire import to_message
 from piezo_ident.record.bags.read import MESSAGE_TYPE, typestore
@@ -53,6 +57,16 @@ def bag(path: Path, n: int = 200, namespace: str = '', pause: float = 0.2) -> li
             writer.write(f'{namespace}/{quantity}', stamp, raw)
     writer.close()
     return stamps
+
+
+def test_the_end_waits_for_a_replay_that_is_slow_to_stop(monkeypatch):
+    # on a machine that stood still a replay took 1.1 s to stop, and nobody heard of it
+    monkeypatch.setattr(ENDING, 'patience', 2.0)
+    replay = Replay('', ())
+    slow = threading.Thread(target=lambda: replay.stop.wait() and time.sleep(1.1))
+    slow.start()
+    PlayerNode.close(SimpleNamespace(_replay=replay, _thread=slow))
+    assert not slow.is_alive()
 
 
 def same(got: list[Samples], want: list[Samples]) -> bool:
