@@ -165,7 +165,7 @@ def linear_inverse(model: StageModel, *, iterated: bool = False) -> LinearInvers
         When G has no static gain, or needs a filter of more than `LONGEST` samples.
     """
     gain = model.dynamics.gain
-    if gain == 0.0 or not np.isfinite(gain):
+    if not 0.0 < gain * gain < np.inf:
         raise ModelError(
             f'this model has no inverse: G has the static gain {gain:g}; identify again'
         )

@@ -4,6 +4,7 @@
 """The inverse of a model: the forward model goes where it was told, or it says why not."""
 
 from dataclasses import replace
+import re
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from paper_stage import FS, PAPER
 import piezo_ident as pi
-from piezo_ident.common.errors import DataError
+from piezo_ident.common.errors import DataError, ModelError
 from piezo_ident.control.linear_inverse import linear_inverse
 from piezo_ident.model.stage_model import EffectSetting
 from piezo_ident.operators.dynamics import Delay, Dynamics
@@ -61,6 +62,13 @@ def test_any_stable_g_has_an_inverse_that_looks_ahead(seed):
     y = model.delay.apply(lfilter(dynamics.b, np.append(1.0, dynamics.a), w))
     assert np.abs(y - x).max() < 1e-3
     assert_allclose(linear_inverse(model)(np.ones(10)), np.ones(10), rtol=1e-9)
+
+
+@pytest.mark.parametrize('gain', [0.0, 1e300, -1e300, 1e-300])
+def test_a_g_without_a_gain_that_can_be_inverted_is_refused(gain):
+    model = replace(PAPER, dynamics=Dynamics(np.empty(0), np.array([gain])))
+    with pytest.raises(ModelError, match=re.escape(f'{gain:g}')):
+        linear_inverse(model)
 
 
 def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
