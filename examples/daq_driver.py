@@ -11,7 +11,7 @@ from piezo_ident.live.guard import Guard, GuardSettings
 from piezo_ident.live.sample_clock import Kind, SampleClock
 from piezo_ident.nodes.ending import ENDING
 from piezo_ident.nodes.lab_node import LabNode, OK, run, WARN
-from piezo_ident.nodes.wire import from_message, publisher_ids, STREAM, to_message
+from piezo_ident.nodes.wire import await_readers, from_message, publisher_ids, STREAM, to_message
 from piezo_ident.record.blocks import Samples
 from std_msgs.msg import Float64MultiArray
 
@@ -102,6 +102,7 @@ class Driver(LabNode):
             self._move(self.guard.idle(round(PERIOD * RATE), 0.7), 'ramp:stop')
             due += PERIOD  # so that what comes late is made up
             time.sleep(max(0.0, due - time.monotonic()))
+        await_readers(self.applied)  # what is still under way would be lost with this process
 
 
 if __name__ == '__main__':

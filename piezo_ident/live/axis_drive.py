@@ -58,13 +58,14 @@ class Drive:
 @dataclass(frozen=True, eq=False)
 class Successor:
     """
-    A new model in the state after `count` samples of voltage, as an inverse and as a free run.
+    A new model in the state after `count` samples of the voltage `past`, inverse and free run.
 
     The free run serves the follower; it is None while `follow` is ``'off'``.
     """
 
     inverse: LiveInverse
     count: int
+    past: History
     run: Stream | None = None
 
 
@@ -188,7 +189,7 @@ class AxisDrive:
     def successor(self, model: StageModel) -> Successor:
         """Bring a model into the state after the voltage so far; any thread may call this."""
         with self._lock:
-            past = self._past.snapshot()
+            own, past = self._past, self._past.snapshot()
         inverse, run = inverse_of(model, self._settings, self._preview), None
         if past:
             period = 1.0 / self._settings.sample_rate
@@ -197,10 +198,13 @@ class AxisDrive:
             if self._follow != 'off':
                 run = inverse.model.stream()
                 run.process(*past.recall(run, inverse.model, period)[::-1])
-        return Successor(inverse, past.count, run)
+        return Successor(inverse, past.count, own, run)
 
     def remembers(self, successor: Successor) -> bool:
         """Return whether each sample of the voltage since a successor was made is still kept."""
+        if successor.past is not self._past:
+            # it was made in an earlier drive; every drive begins at rest
+            return not self.tick
         return self._past.since(successor.count).size >= self.tick - successor.count
 
     def take_over(self, successor: Successor) -> None:

@@ -237,6 +237,8 @@ class Corrector:
         # displacement has come or is given up
         self._next, self._told, self._decided = 0, -1, -1
         self._last: Array | None = None
+        # time of the tick before `_next` [s]
+        self._newest = np.nan
         # motion by other axes, a horizon before the next sample
         self._felt = np.zeros(self._horizon)
         # see `Estimated.is_settled`
@@ -266,7 +268,7 @@ class Corrector:
             self._forget()
             self._clock.judge(t)
             model = self._model
-            if model.is_static:
+            if model.is_static and np.isfinite(period):
                 model = replace(model, sample_rate=1.0 / period)
             if not self._is_new:
                 self._attribution = Attribution(model, self._horizon, self._at_rest)
@@ -286,7 +288,7 @@ class Corrector:
             between = lines_between(self._last, rows[:, 0], missing)
             self._wait(Samples(np.full(missing, np.nan), between[1]), between)
         self._wait(prediction, rows)
-        self._last = rows[:, -1]
+        self._last, self._newest = rows[:, -1], float(t[-1])
         return self._estimates()
 
     def _wait(self, prediction: Samples, rows: Array) -> None:
@@ -298,7 +300,8 @@ class Corrector:
         """Take displacement [m] at times t [s] with a prediction; return finished estimates."""
         if self._observer is None or np.isnan(self._clock.period):
             return []
-        ticks = np.rint((t - self._clock.begin) / self._clock.period).astype(np.int64)
+        # from the newest sample: over hours the rounding of the period would add up
+        ticks = self._next - 1 + np.rint((t - self._newest) / self._clock.period).astype(np.int64)
         self._measured.append((ticks, y))
         self._told = max(self._told, int(ticks[-1]))
         return self._estimates()
@@ -338,7 +341,7 @@ class Corrector:
         """Return the free run of the learnt model, which learns from y a horizon before [m]."""
         free = block.prediction.values - block.felt
         ticks = np.arange(block.tick, block.tick + free.size, dtype=np.float64)
-        t = self._clock.begin + ticks * self._clock.period
+        t = self._newest + (ticks - (self._next - 1)) * self._clock.period
         if self._adaptation is not None:
             free = self._adaptation.process(block.v, t, free, y, self._is_settled)
         if self._attribution is not None:

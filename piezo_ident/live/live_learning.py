@@ -60,10 +60,16 @@ class LiveLearning:
         limits, rows = (settings.low, settings.high), dict(zip(axes, reference, strict=True))
         self._learning = AxesLearning(model, rows, limits=limits, slew=settings.slew)
         self.each = {axis: self._learning.each[axis] for axis in axes}
-        self.again()
+        self._lock = threading.Lock()
+        self._plan()
 
-    def again(self) -> None:
-        """Plan a repetition."""
+    def again(self) -> LiveLearning:
+        """Plan the repetition anew, when a thread that plans it is done; return itself."""
+        with self._lock:
+            self._plan()
+        return self
+
+    def _plan(self) -> None:
         s, drives = self.settings, [one.drive for one in self.each.values()]
         lead = max(drive.lead for drive in drives)
         v = np.stack([np.pad(x.v, (lead - x.lead, 0), mode='edge') for x in drives])
@@ -100,11 +106,12 @@ class LiveLearning:
 
     def take(self) -> None:
         """Learn from the measured displacement, and plan the next repetition."""
-        try:
-            self._learning.take(dict(zip(self.each, self._measured, strict=True)))
-        finally:
-            # the plan of the axes that have learnt has changed
-            self.again()
+        with self._lock:
+            try:
+                self._learning.take(dict(zip(self.each, self._measured, strict=True)))
+            finally:
+                # the plan of the axes that have learnt has changed
+                self._plan()
 
 
 class Learner:
@@ -192,7 +199,7 @@ class Learner:
         elif tracker.is_at_rest and now - self._resting > PATIENCE:
             raise ConfigError(
                 f'the displacement of repetition {self._count + 1} did not come in full; is '
-                'there a stage, and did it lose blocks?'
+                'there a stage, and does it lose blocks or read what is no number?'
             )
 
     @property

@@ -325,7 +325,7 @@ class Predictor:
                 raise ModelError(f'the prediction at t = {t[0]:.6g} s is not finite')
         except ModelError as error:
             self.problem = f'{error}; the prediction begins anew'
-            self._run, self._bands = None, []
+            self._clear()
             return None
         self.felt = self._run.felt
         return y

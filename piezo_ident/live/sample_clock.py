@@ -306,6 +306,9 @@ class BlockClock:
         first, last, before = float(t[0]), float(t[-1]), self.last
         if last > first:
             self.period = (last - first) / (t.size - 1)
+        elif np.isnan(self.period) and first > before:
+            # a stream of single samples
+            self.period = first - before
         if np.isnan(before):
             self.begin, self.last = first, last
             return Kind.START, 0

@@ -50,7 +50,7 @@ class ExclusivePublisher:
         self._publisher: Any = self._created() if stays else None
         self._listener: Any = None
         self._lock = threading.Lock()
-        self._begin = self._met = self._free = 0.0
+        self._begin = self._met = self._free = self._drives = 0.0
         self._sent = self._heard = 0
         self._known: dict[bytes, str] = {}
 
@@ -71,7 +71,7 @@ class ExclusivePublisher:
         # a node without a known name yet may have the own name
         self._refuse(name for name in self.others() if name != UNNAMED)
         self.stop_listening()
-        self._begin, self._met, self._free = time.monotonic(), 0.0, 0.0
+        self._begin, self._met, self._free, self._drives = time.monotonic(), 0.0, 0.0, 0.0
         self._sent = self._heard = 0
         if self._publisher is None:
             self._publisher = self._created()
@@ -110,8 +110,8 @@ class ExclusivePublisher:
         """
         Refuse to go on when another publisher has sent a block, with a ConfigError.
 
-        The thread that sends calls this.  The search ends `TOGETHER` after the right to drive was
-        granted: two nodes that ask at the same moment hear each other only when both send.
+        The thread that sends calls this.  The search ends `TOGETHER` after the first sent block:
+        two nodes that ask at the same moment hear each other only when both send.
         """
         with self._lock:
             listener = self._listener
@@ -127,7 +127,7 @@ class ExclusivePublisher:
             if names.count(own) > 1 or not others:
                 others.append(f'another {own}')
             raise ConfigError(f'{" or ".join(others)} drives {self.topic} now; end it first')
-        if listener and self._free and time.monotonic() > self._free + TOGETHER:
+        if listener and self._drives and time.monotonic() > self._drives + TOGETHER:
             self.stop_listening()
 
     def _await_publishers(self, now: float) -> None:
@@ -149,6 +149,7 @@ class ExclusivePublisher:
     def send(self, samples: Samples) -> None:
         """Send a block."""
         self._sent += 1
+        self._drives = self._drives or time.monotonic()
         self._publisher.publish(to_message(samples))
 
     def others(self) -> list[str]:

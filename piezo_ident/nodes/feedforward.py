@@ -121,16 +121,16 @@ class FeedforwardNode(DrivingNode):
         return None
 
     def apply(self, changed: Mapping[str, Any]) -> None:
-        """Take a model file, another window or silence, or other limits."""
+        """Take another window or silence, other limits, and last a model file, which counts."""
         if 'silence' in changed:
             self._sample_clock.longest_gap = changed['silence']
         if 'window' in changed:
             for one in self._errors.each.values():
                 one.live.window = changed['window']
-        if (model := self._model) is not None and set(changed) & set(LIMITS):
+        (model, _), source = self._later or ((self._model, None), self._source)
+        if model is not None and set(changed) & set(LIMITS):
             self._tracker = None
-            self._loader.load(self._source, lambda: model)
-        # the loader keeps the newest wish, which is the file
+            self._loader.load(source, lambda: model)
         if path := changed.get('model'):
             self._loader.load_file(path)
 
@@ -183,15 +183,15 @@ class FeedforwardNode(DrivingNode):
         kept, axes = self._wanted.kept, [f'y{tail}' for tail in self._tails]
         if kept is None or self._model is None:
             raise ConfigError('there is no reference to repeat: call ~/start, and send one')
-        if self._wanted.length > self.values['longest'] * self._rate_of_clock:
-            raise ConfigError('the last reference is longer than is kept; raise longest')
+        if kept.shape[1] < self._wanted.length:
+            raise ConfigError('the last reference was not kept: raise longest, and send it again')
         self._begin()
         model, settings, before = self._model, self._settings(), self._learned
 
         def make() -> LiveLearning:
             if before and before.model is model and before.settings == settings:
                 if np.array_equal(before.reference, kept):
-                    return before
+                    return before.again()
             return LiveLearning(model, kept, settings, axes)
 
         self._learner = Learner(make, self.values['repetitions'], self._played)
@@ -205,8 +205,8 @@ class FeedforwardNode(DrivingNode):
             later, self._later = self._later, None
             self._take_model(*later)
         if self._tracker is None:
-            reason = self._refusal or 'publish one on the topic model, or set the parameter model'
-            raise ConfigError(f'there is no model: {reason}')
+            how = 'call again soon' if self._model else 'publish one, or set the parameter model'
+            raise ConfigError(f'there is no model: {self._refusal or how}')
         self._errors = TrackingErrors(self._tails, self.values['window'])
         self._sample_clock = SampleClock(self._rate_of_clock, self.values['silence'])
         self._take_right(self._tracker)
@@ -245,8 +245,7 @@ class FeedforwardNode(DrivingNode):
 
     def _take_complete(self) -> None:
         """Take the blocks of the reference whose further axes have come or are overdue."""
-        heard = self._references.items()
-        resting = [tail for tail, x in heard if tail and not x.get_publisher_count()]
+        resting = [t for t, x in self._references.items() if t and not x.get_publisher_count()]
         for block in self._wanted.join.complete(
             lambda since: self._looks.is_over(since, PATIENCE), resting
         ):
@@ -262,14 +261,15 @@ class FeedforwardNode(DrivingNode):
         x, faults = self._wanted.take(samples, verdict, resting, self.values['longest'])
         for fault in faults:
             self._faults.note(*fault)
-        if is_new:
-            self._answered = self._last
+        self._answered = self._last if is_new else self._answered
         if (tracker := self._tracker) is not None:
             self._counts['streams'] += is_new
             self._play(tracker.process(x, is_new and self._state == 'tracking'))
             self._state = 'tracking'
 
     def _play(self, drive: Drive) -> None:
+        if not drive.t.size:
+            return  # a single sample behind a change of the model
         at = round((float(drive.t[0]) - self.values['preview']) * self._rate_of_clock)
         self._segment = self._wanted.label(at)
         self._send(drive.t, drive.v, self._segment)
@@ -311,19 +311,19 @@ class FeedforwardNode(DrivingNode):
         tracker, learner = self._tracker, self._learner
         if self._state == 'waiting' or tracker is None:
             return 'learning' if learner else 'ready'
+        if self._state in ('ready', 'tracking'):
+            self._take_complete()
         if self._state == 'learning' and learner is not None:
             self._repeat(tracker, learner)
-        elif self._state == 'tracking':
-            self._take_complete()
-            if self._looks.is_over(self._last, self.values['silence']):
-                self._play(tracker.finish())
-                self._halt('done', 'the reference has ended')
+        elif self._state == 'tracking' and self._looks.is_over(self._last, self.values['silence']):
+            self._play(tracker.finish())
+            self._halt('done', 'the reference has ended')
         return ''
 
     def _repeat(self, tracker: Tracker, learner: Learner) -> None:
         learner.step(tracker)
+        self._learned = learner.learning or self._learned
         if learner.is_over:
-            self._learned = learner.learning
             self._halt('done', learner.text)
         elif learner.is_played and not tracker.is_at_rest:
             self._send_ramp(tracker)

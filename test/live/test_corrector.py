@@ -328,3 +328,26 @@ def test_a_model_that_comes_later_learns_as_one_from_the_start():
         got.append((line.rows[1][-2000:], line.corrector.told['learnt/gain']))
     assert_allclose(*(x for x, _ in got), rtol=0, atol=2e-8)
     assert got[1][1] == pytest.approx(0.03, abs=2e-3)
+
+
+def test_the_time_base_holds_for_days():
+    # after 3 years the period of a block of 10 samples is wrong by some 1e-5
+    def estimated(begin):
+        line = Line()
+        for k in range(0, N, 10):
+            t = begin + T[k : k + 10]
+            line.drove(Samples(t, V[k : k + 10]))
+            line.moved(Samples(t, Y[k : k + 10], '', 'displacement'))
+        return line.rows[1]
+
+    assert_allclose(estimated(1e8), estimated(0.0), atol=1e-12)
+
+
+def test_a_static_model_begins_with_a_single_sample():
+    static = replace(MODEL, dynamics=Dynamics.unit(), delay=replace(MODEL.delay, samples=0))
+    corrector = Corrector(horizon=2)
+    corrector.set_model(static)
+    corrector.predicted(Samples(T[:1], V[:1]), Samples(T[:1], V[:1]), known=True)
+    later = Samples(T[1:100], V[1:100])
+    corrector.predicted(later, later, known=True)
+    assert corrector.measured(T[:100], Y[:100])

@@ -4,6 +4,7 @@
 """A motion that is repeated: what is sent, what came back, what was learned."""
 
 from dataclasses import replace
+import threading
 
 from effect_table import VISIBLE
 import numpy as np
@@ -70,3 +71,26 @@ def test_a_lost_block_is_waited_for_until_it_is_sent_again(monkeypatch, late, co
     else:
         with pytest.raises(ConfigError, match='of repetition 1 did not come in full'):
             learner.step(tracker)
+
+
+def test_a_repetition_begins_anew_when_the_plan_of_a_former_one_is_done():
+    learning = LiveLearning(PAPER, np.full((1, 200), 30e-6), SETTINGS)
+    begun, may_end, order = threading.Event(), threading.Event(), []
+
+    def slow(measured):
+        begun.set()
+        may_end.wait()
+        order.append('learnt')
+
+    learning._learning.take = slow
+    former = threading.Thread(target=learning.take)
+    former.start()
+    begun.wait()
+    learning.measured(Samples(np.arange(9000) / FS, np.zeros(9000)), 0)
+    anew = threading.Thread(target=lambda: order.append(learning.again()))
+    anew.start()
+    may_end.set()
+    former.join()
+    anew.join()
+    # what came of the former one is no part of the next
+    assert order == ['learnt', learning] and np.isnan(learning._measured).all()

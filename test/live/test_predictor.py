@@ -3,6 +3,8 @@
 
 """A model beside a running stage, and what is made of its residual."""
 
+from dataclasses import replace
+
 import numpy as np
 from piezo_ident.common.errors import ModelError
 from piezo_ident.live.history import TurningPoints
@@ -488,3 +490,19 @@ def test_blocks_that_are_kept_are_bounded(monkeypatch):
     for b in [block(0, 2), *(block(k, 1) for k in range(2, 200))]:
         predictor.process(b)
     assert len(predictor._pasts[0]._recent) == 50
+
+
+def test_behind_a_voltage_beyond_all_numbers_nothing_is_known_and_all_is_finite():
+    m, n = model(), 2000
+    predictor = running(m)
+    blocks = cut(drive(n))
+    blocks[10] = replace(blocks[10], values=np.full(blocks[10].values.size, 1e308))
+    for block in blocks[:11]:
+        predictor.process(block)
+    assert 'not finite' in predictor.problem
+    assert not predictor.memory_known
+    y = predicted(predictor, blocks[11:])
+    assert np.isfinite(y).all()
+    # a model that comes later runs through the voltage that is kept
+    predictor.set_model(m)
+    assert np.isfinite(predictor.process(cut(drive(n + 100))[-1]).values).all()

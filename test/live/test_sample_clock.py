@@ -202,3 +202,10 @@ def test_a_clock_that_goes_ahead_by_more_than_a_day_is_another_one():
     steps = [t, t + 0.01, t + 1e9, t + 0.01]
     assert [clock.judge(x)[0].value for x in steps] == ['start', 'gap', 'start', 'start']
     assert (clock.lost, clock.restarts) == (100, 2)
+
+
+def test_a_stream_of_single_samples_has_a_period():
+    clock = BlockClock()
+    kinds = [clock.judge(np.array([k / 1000.0]))[0] for k in (0, 1, 2, 5)]
+    assert kinds == [Kind.START, Kind.NEXT, Kind.NEXT, Kind.GAP]
+    assert clock.period == 1e-3 and clock.lost == 2

@@ -225,3 +225,21 @@ def test_another_model_takes_over_and_is_followed_anew():
     # the motion itself moves by 0.21 V from sample to sample
     assert np.abs(np.diff(np.concatenate(v)[int(FS) // 4 :])).max() < 0.03
     assert np.sqrt(np.mean(np.concatenate(error)[-int(FS) // 2 :] ** 2)) < 1e-3 * 40e-6
+
+
+def test_a_model_prepared_in_one_drive_does_not_take_over_in_the_next():
+    tracker = Tracker(PAPER, SETTINGS)
+    tracked(tracker, sine(0.5))
+    successor = tracker.successor(PAPER)
+    assert tracker.remembers(successor)
+    tracker.reset()
+    tracked(tracker, np.full(800, tracker.rest[0]))
+    # the voltage would step towards where the drive before it ended
+    assert not tracker.remembers(successor)
+
+
+def test_a_single_sample_behind_a_change_of_the_model_waits_for_the_next():
+    tracker = Tracker(PAPER, SETTINGS)
+    tracked(tracker, sine(0.1))
+    tracker.take_over(tracker.successor(PAPER))
+    assert [tracker.process(np.full(n, 35e-6)).t.size for n in (1, 99)] == [0, 100]

@@ -399,6 +399,7 @@ class Idle(FeedforwardNode):
         self.values = {**limits, 'slew': 4e4, 'ramp_slew': 20.0, 'follow': 'off'}
         self._rate_of_clock, self._tails, self._state = FS, [''], 'idle'
         self._model, self._source, self._refusal, self._models = 'old', 'old.yaml', '', 0
+        self._later = None
         self._errors, self.wishes = SimpleNamespace(clear=lambda: None), []
         self._loader = SimpleNamespace(
             load=lambda source, read: self.wishes.append((source, read())),
@@ -480,7 +481,7 @@ def test_a_model_that_was_prepared_before_the_kept_voltage_is_prepared_again(cou
     node, taken = Idle(), []
     node._tracker.remembers = lambda new: new.count >= 100
     node._tracker.take_over = taken.append
-    node._take_model(('new', Successor(None, count)), 'topic model')
+    node._take_model(('new', Successor(None, count, None)), 'topic model')
     assert node.wishes == wishes and len(taken) == (not wishes)
 
 
@@ -491,6 +492,7 @@ def test_learning_goes_on_within_the_same_limits_alone(monkeypatch):
     node.values |= {'longest': 1.0, 'repetitions': 1}
     node._wanted, node._begin = SimpleNamespace(kept=kept, length=10), lambda: None
     before = SimpleNamespace(model='old', reference=kept, settings=node._settings())
+    before.again = lambda: before
     node._learned = before
     node._learn()
     assert node._learner is before

@@ -97,7 +97,7 @@ class DiagnosisSession:
         most = self._host.values['requests']
         if len(self._requested) >= most:
             return f'no more than {most} requests are allowed'
-        return '' if self._host.can_excite() else 'there is no excitation and no stage'
+        return '' if self._host.can_excite() else 'there is no excitation or no stage'
 
     def _diagnose(self, model: StageModel | MultiAxisModel) -> None:
         settings = DiagnosisSettings(seed=self._host.values['seed'])

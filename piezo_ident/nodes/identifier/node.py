@@ -315,7 +315,8 @@ class IdentifierNode(LabNode):
         if error is not None:
             self._session.drop()
         if isinstance(error, Cancelled):
-            self._set_state('cancelled', 0.0, f'{self._task} was cancelled; nothing was changed')
+            what = 'nothing was changed' if self._task != 'saving' else 'files may be replaced'
+            self._set_state('cancelled', 0.0, f'{self._task} was cancelled; {what}')
         elif error is not None:
             self.fail(' '.join(self.reason(error).split()))
         elif isinstance(result, IdentificationOutcome):
@@ -328,11 +329,9 @@ class IdentifierNode(LabNode):
                 each = each_of(identified).values()
                 for warning in dict.fromkeys(w for x in each for w in x.warnings):
                     self.journal.tell(warning, WARN)
-            level = WARN if result.warnings else OK
-            text, brief = (
-                jobs.with_warnings(t, result.warnings) for t in (result.message, result.brief)
-            )
-            figures = {**result.figures, 'warnings': result.warnings}
+            n = result.warnings
+            text, brief = (jobs.with_warnings(t, n) for t in (result.message, result.brief))
+            level, figures = WARN if n else OK, {**result.figures, 'warnings': n}
             self._set_state('done', 100.0, text, level, brief=brief, **figures)
         elif isinstance(result, DiagnosisOutcome):
             self._session.take_outcome(result)

@@ -181,7 +181,7 @@ def test_an_excitation_that_refuses_or_is_gone_leaves_the_verdict_as_it_is(lab):
     lab.session.take_outcome(first)
     assert lab.end[0] is first
     assert lab.end[1] == (
-        'this and that cannot be told apart, and there is no excitation and no stage',
+        'this and that cannot be told apart, and there is no excitation or no stage',
     )
 
 
