@@ -258,7 +258,7 @@ _solver = click.Choice(SOLVERS)
 #: fields of `Settings`
 IDENTIFY = [
     _option('--thresholds', _thresholds, 'N|auto', 'Plays of H (default: by held-out error).'),
-    _option('--order', _order, 'NA,NB', 'Order of G (default: searched).'),
+    _option('--order', _order, 'NA,NB', 'Order of G, less slow poles (default: searched).'),
     _option('--max-order', _whole, 'N', 'Largest order of the search (default: 15).'),
     _option('--delay', _whole, 'SAMPLES', 'Delay (default: identified).'),
     _option('--hold-out', float, 'SECONDS', 'End of an unlabelled record that is held out.'),

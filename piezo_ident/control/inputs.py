@@ -87,10 +87,11 @@ def rest_at(model: StageModel, y: Array, bounds: tuple[float, float], clip: bool
         is_far, um = max(below, -above) > FAR, 1e6 * y
         # the whole motion, not its start alone, has to come within reach
         missed = 1e-6 * (ends[0] - um.min() if um[0] < ends[0] else ends[1] - um.max())
+        way = shifted(missed, float(np.ptp(y)), 1e-6 * (ends[1] - ends[0]))
         raise DataError(
             f'the wanted motion starts at {1e6 * y[0]:.4g} um; between {s.v(bounds[0]):g} and '
             f'{s.v(bounds[1]):g} V the stage rests at {ends[0]:.4g} .. {ends[1]:.4g} um'
-            + ('; is the motion in metres?' if is_far else f'; {shifted(missed)}'),
+            + ('; is the motion in metres?' if is_far else f'; {way}'),
             options='' if is_far else '--clip',
         )
     if below >= 0.0 or above <= 0.0:
@@ -127,6 +128,8 @@ def faint(model: StageModel, y: Array) -> list[str]:
     ]
 
 
-def shifted(by: float) -> str:
-    """Say by how much a motion must be raised or lowered [m]."""
+def shifted(by: float, size: float, reach: float) -> str:
+    """Say by how much a motion must be raised or lowered, or that it must be narrower [m]."""
+    if size > reach:
+        return f'make the motion narrower than the {1e6 * reach:.4g} um within reach'
     return f'{"raise" if by > 0.0 else "lower"} the motion by {1e6 * abs(by):.3g} um'

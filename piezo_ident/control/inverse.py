@@ -356,7 +356,9 @@ def _out_of_reach(task: _Task, best: _Pass, used: slice, missed: Mask, most: flo
         ways = 'slow it down', f'round it over two periods of the lowest mode, {mode:.4g} Hz'
         remedy = f'; the motion jumps there: {ways[bool(np.isfinite(mode))]}'
     elif np.isinf(slew) and (at_top.all() or not at_top.any()):
-        remedy = f'; {shifted(-most if at_top[0] == (s.Y > 0.0) else most)}'
+        ends = [float(task.model.chain().reset(u, u)) for u in (low, high)]
+        size, reach = (abs(s.Y) * float(np.ptp(of)) for of in (x, ends))
+        remedy = f'; {shifted(-most if at_top[0] == (s.Y > 0.0) else most, size, reach)}'
     speed = '' if np.isinf(slew) else f' and at {slew:g} V/s'
     return (
         f'{t.size} samples of the wanted motion, between {t[0]:.4g} and {t[-1]:.4g} s, are out of '

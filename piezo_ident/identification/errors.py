@@ -101,10 +101,10 @@ def errors_of(
     rows = []
     for p, (fitted, selection) in zip(predictions, masks, strict=True):
         piece, stroke = p.run.piece, stroke_of[p.run.record]
-        names = [(s.label, s.start, s.stop) for s in piece.segments]
-        for label, start, stop in names or [('', 0, piece.n)]:
+        names, rest = [(s.label, s.start, s.stop) for s in piece.segments], p.run.use.copy()
+        for label, start, stop in (*names, ('', 0, piece.n)):
             part = np.zeros(piece.n, dtype=bool)
-            part[start:stop] = p.run.use[start:stop]
+            part[start:stop], rest[start:stop] = rest[start:stop].copy(), False
             for data, mask in (
                 ('fitted', part & fitted),
                 ('selection', part & selection),
@@ -192,8 +192,7 @@ def validation_errors(model: StageModel, records: Sequence[Record]) -> list[Erro
 
 def _residual(model: StageModel, run: Run) -> Array:
     """Compute the free-run residual of a run [m]."""
-    memory = run.start(model.hysteresis.thresholds)
-    return run.piece.y - model.predict_piece(run.piece, memory)
+    return run.piece.y - model.predict_piece(run.piece, run.start(model.hysteresis.thresholds))
 
 
 def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
@@ -210,8 +209,7 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
             for kinds in (('triangle',), ('step', 'settle', 'noise'))
         )
         if sweeps.size and small.size:
-            shift = float(small.mean() - sweeps.mean())
-            if abs(shift) > ELSEWHERE * float(sweeps.std()):
+            if abs(float(small.mean() - sweeps.mean())) > ELSEWHERE * float(sweeps.std()):
                 return True
     return False
 
@@ -220,7 +218,7 @@ def squares_left(model: StageModel, runs: Sequence[Run]) -> float:
     """Sum the squared residuals over the held-out samples, around the mean of each run [m^2]."""
     left = 0.0
     for run in runs:
-        kept = run.held_out() & run.use
+        kept = run.held_out() & run.known
         if kept.any():
             e = _residual(model, run)[kept]
             left += float(np.sum((e - e.mean()) ** 2))

@@ -122,8 +122,7 @@ def _stretches(runs: Sequence[Run], parts: Sequence[Mask]) -> tuple[list[Stretch
         n = max(1, round(run.u.size / size))
         block = count + np.minimum(np.arange(run.u.size) * n // run.u.size, n - 1)
         count += n
-        rate = run.piece.sample_rate
-        stretches.append(Stretch(run.u, run.x, run.use & mask, block, rate, i, i))
+        stretches.append(Stretch(run.u, run.x, run.use & mask, block, run.piece.sample_rate, i, i))
         if abs(float(run.u[0])) < REST and not rises_first(run.piece):
             guesses[i] = 0.0
     return stretches, guesses

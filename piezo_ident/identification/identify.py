@@ -37,11 +37,11 @@ from piezo_ident.identification.step1_delay import first_step
 from piezo_ident.identification.step2_dynamics import second_step
 from piezo_ident.identification.three_steps import fit_three_steps
 from piezo_ident.identification.warnings import warn_of_shape, warnings_of
-from piezo_ident.model.metrics import FORMULA, percent
+from piezo_ident.model.metrics import FORMULA, percent, strokes
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay
 from piezo_ident.record.readings.faults import without_faults
-from piezo_ident.record.record import Record, records_of
+from piezo_ident.record.record import named_apart, Record, records_of
 from piezo_ident.selection.judged import Judged, JudgedRun
 from scipy import __version__ as scipy_version
 
@@ -86,12 +86,14 @@ def _identify(
     progress: Progress,
     steps: Steps | None,
 ) -> tuple[Identification, Judged]:
-    data = prepare(records)
-    validation = [without_faults(record) for record in validation]
+    records, validation = named_apart(records, validation)
+    data, validation = prepare(records), [without_faults(record) for record in validation]
     refuse_delay(data.pieces, settings.delay)
     fit = _fitted(data, settings, progress, steps)
-    model, stroke = fit.model, abs(data.scaling.Y)
-    judged, predictions = _predicted(fit, data.runs)
+    model, (judged, predictions) = fit.model, _predicted(fit, data.runs)
+    # a sensor may have been zeroed between two records
+    stroke = max(strokes((p.run.record, p.run.piece.y) for p in predictions).values())
+    beyond = [text for record in validation for text in model.extrapolation(record)]
     floor, shape = noise_floor_of(predictions), warn_of_shape(predictions, data.scaling)
     result = Identification(
         model=model,
@@ -102,7 +104,7 @@ def _identify(
         noise_floor=None if floor.rms is None else percent(floor.rms, stroke),
         noise_source=floor.source,
         stroke=stroke,
-        warnings=(*data.warnings, *fault_lines(validation), *fit.warnings, *shape),
+        warnings=(*data.warnings, *fault_lines(validation), *fit.warnings, *shape, *beyond),
         not_identified=tuple(fit.not_identified),
         settings=settings,
         records=(*data.records, *validation),

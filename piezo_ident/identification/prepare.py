@@ -284,8 +284,7 @@ def _correlation(piece: Piece) -> float:
         v, y = v - v.mean(), y - y.mean()
         energy = float(np.sqrt((v @ v) * (y @ y)))
         r = float(v @ y) / energy if energy > 0.0 else 0.0
-        r = float(np.copysign(max(0.0, abs(r) - 1.0 / np.sqrt(n)), r))
-        best = max(best, r, key=abs)
+        best = max(best, float(np.copysign(max(0.0, abs(r) - 1.0 / np.sqrt(n)), r)), key=abs)
         size *= 2
     return best
 

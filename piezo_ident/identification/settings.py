@@ -41,7 +41,7 @@ class Settings:
     max_order : int
         Largest na and nb of the search.
     order : tuple of int, optional
-        Orders (na, nb); no search takes place.
+        Orders (na, nb); no search takes place.  Poles too slow for G still leave it.
     delay : int, optional
         Delay [samples]; no delay is fitted.
     swarm_size, swarm_iterations : int
@@ -59,9 +59,8 @@ class Settings:
 
     Examples
     --------
-    Settings of the paper:
-
-    >>> paper = Settings(thresholds=10, solver='swarm')
+    >>> import piezo_ident as pi
+    >>> as_in_the_paper = pi.Settings(thresholds=10, solver='swarm')
     """
 
     thresholds: int | None = None
@@ -81,7 +80,7 @@ class Settings:
         rules = {
             'thresholds': (self.thresholds is None or 2 <= self.thresholds <= 400, '2 to 400'),
             'solver': (self.solver in SOLVERS, ' or '.join(SOLVERS)),
-            'polish': (not self.polish or self.solver == 'swarm', 'False without the swarm'),
+            'polish': (not self.polish or self.solver == 'swarm', "False without solver='swarm'"),
             'max_order': (1 <= self.max_order <= 50, '1 to 50'),
             'order': (
                 isinstance(sizes, Sequence)

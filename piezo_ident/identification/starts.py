@@ -28,6 +28,8 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 Rule = Callable[[Array], Array]
 
+#: kinds of segments that the three steps fit; all others are only judged
+FITTED = ('triangle', 'noise', 'settle', 'step')
 #: number of blocks into which a run is thinned: to choose a guess, and to fit the memory
 ROUGH, BLOCKS = 500, 2000
 #: number of plays of the temporary H, and of the blocks of a run in the fit (both taste)
@@ -107,12 +109,10 @@ def fit_starts(
 
     def full_fit(one: Fit) -> Fit:
         starts, guesses = (np.repeat(x, FINER, 1) for x in (one.stage.starts, one.stage.guesses))
-        finer = replace(one.stage, starts=starts, guesses=guesses)
-        return fit(finer, stretches, iterations=MANY)
+        return fit(replace(one.stage, starts=starts, guesses=guesses), stretches, iterations=MANY)
 
     plain, *others = map(rough_fit, _guesses())
-    best = [plain, *sorted(others, key=lambda one: one.loss)[:BEST]]
-    plain, *others = map(full_fit, best)
+    plain, *others = map(full_fit, [plain, *sorted(others, key=lambda one: one.loss)[:BEST]])
     chosen = min(others, key=lambda one: one.loss)
     stage = (chosen if chosen.loss < (1.0 - CLEARLY) * plain.loss else plain).stage
     for i in sought:
@@ -130,16 +130,17 @@ def lag_of(G: Dynamics, delay: Delay) -> float:
 
 def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
     """
-    Fit the memory at the start of runs to the fitted samples of their triangles.
+    Fit the memory at the start of runs to their fitted samples.
 
     All samples of a run count as known once its memory is fitted.  `lag` is as in `fit_starts`.
     """
-    excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
+    # triangles may not depend on what came before steps and noise
+    excerpts = [run.excerpt(run.mask(*FITTED) & run.use & ~run.held_out()) for run in runs]
     driven = [i for i, e in enumerate(excerpts) if e.use.any()]
-    unknown = [not bool(np.array_equal(runs[i].known, runs[i].use)) for i in driven]
+    unknown = [bool((excerpts[i].use & ~runs[i].known).any()) for i in driven]
     fitted_runs = list(runs)
     rules = fit_starts([excerpts[i] for i in driven], unknown, lag)
-    for i, rule in zip(driven, rules, strict=True):
-        if rule is not None:
+    for i, rule, is_sought in zip(driven, rules, unknown, strict=True):
+        if rule is not None and is_sought:
             fitted_runs[i] = replace(runs[i], memory=rule, known=runs[i].use)
     return fitted_runs

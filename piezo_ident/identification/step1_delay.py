@@ -139,8 +139,7 @@ def find_jumps(v: Array, before: int, after: int) -> Integers:
         return np.asarray(large, dtype=np.int64)
     # ahead[k - before] is the largest difference between the samples k - before .. k - 1
     ahead = np.lib.stride_tricks.sliding_window_view(dv, before - 1).max(axis=1)
-    quiet = ahead[large - before] < 0.05 * dv[large - 1]
-    return np.asarray(large[quiet], dtype=np.int64)
+    return np.asarray(large[ahead[large - before] < 0.05 * dv[large - 1]], dtype=np.int64)
 
 
 def step_responses(
@@ -218,8 +217,7 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
         rest = (_mean(np.delete(responses, i, 0), np.delete(weight, i)) for i in range(n))
         left_out = [_first_rise(mean_of_rest, before, rounding)[0] for mean_of_rest in rest]
         delays = np.array([after if s is None else s for s in left_out], dtype=float)
-        jackknife = np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))
-        std = max(std, float(jackknife))
+        std = max(std, float(np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))))
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 
@@ -328,7 +326,9 @@ def first_step(runs: Sequence[Run], settings: Settings, progress: Progress) -> D
         )
     run, start, stop = longest_noise(runs)
     std = 0.5 * run.piece.sample_rate / band_of(run, start, stop)
-    return DelayResult(scan, std, 'scan', step, loss, scan)
+    result = DelayResult(scan, std, 'scan', step, loss, scan)
+    # periodic steps have the same loss at a delay that is longer by the time between two steps
+    return _checked_delay(result, runs) if has_noise and pieces else result
 
 
 def _checked_delay(result: DelayResult, runs: Sequence[Run]) -> DelayResult:

@@ -261,8 +261,7 @@ def second_step(
 
     excerpts = excerpts_of(runs, 'triangle')
     swing = max(e.swing for e in excerpts)
-    excursion = float(np.ptp(run.u[start:stop]))
-    r = fine_thresholds(swing, excursion)
+    r = fine_thresholds(swing, float(np.ptp(run.u[start:stop])))
 
     def undo(G: Dynamics) -> Hysteresis:
         return fit_hysteresis(factorise(excerpts, r, G, delay), r).hysteresis
@@ -289,6 +288,7 @@ def second_step(
     progress('dynamics', 1.0)
     complete = replace(
         result,
+        order=(G.a.size, G.b.size),
         covariance=fit.normalised_covariance,
         response=response,
         bias=float(run.u[start:stop].mean()),

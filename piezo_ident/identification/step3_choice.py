@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 from piezo_ident.common.arrays import Array
@@ -259,7 +260,7 @@ def _parts(
     total = sum(e.rows for e in excerpts)
     parts = []
     for e, rows in zip(excerpts, filtered_rows(excerpts, law, dynamics, delay), strict=True):
-        for part in np.array_split(rows, max(1, round(PARTS * e.rows / max(total, 1)))):
+        for part in np.array_split(rows, max(1, math.ceil(PARTS * e.rows / max(total, 1)))):
             parts.append(triangular_factor([part], rows.shape[1]) / np.sqrt(max(len(part), 1)))
     return parts
 

@@ -127,8 +127,7 @@ def filtered_rows(
         before, u = excerpt.u[:begin], excerpt.u[begin:end]
         # advance the memory alone; a frozen array would be another type to the compiler
         hysteresis(before, np.array(r), np.zeros(r.size), 0.0, 0.0, memory, np.empty(begin))
-        u = Delay(delay.samples).apply(u)
-        for j, column in enumerate(law.columns(u, memory), start=k):
+        for j, column in enumerate(law.columns(Delay(delay.samples).apply(u), memory), start=k):
             _average(filter_arx(G.a, G.b, column), stretches, row, block[j])
         _average(excerpt.x[begin:end], stretches, row, block[-1])
         yield block.T

@@ -25,7 +25,7 @@ from piezo_ident.identification.errors import (
 from piezo_ident.identification.prepare import Excerpt, excerpts_of, Run
 from piezo_ident.identification.results import FitOutcome, Steps
 from piezo_ident.identification.settings import Progress, Settings
-from piezo_ident.identification.starts import lag_of, with_starts
+from piezo_ident.identification.starts import FITTED, lag_of, with_starts
 from piezo_ident.identification.step1_delay import DelayResult, first_step
 from piezo_ident.identification.step2_dynamics import (
     beside_law,
@@ -83,8 +83,7 @@ def fit_three_steps(
     if outside := warn_of_triangle(*span, scaling):
         warnings += outside
         model = within(model, *span)
-    kinds = ('triangle', 'noise', 'settle', 'step')
-    masks = [(run.mask(*kinds) & ~(out := run.held_out()), out) for run in runs]
+    masks = [(run.mask(*FITTED) & ~(out := run.held_out()), out) for run in runs]
     results = model, delay_result, best.dynamics, best.hysteresis
     memories = fitted_memories(runs, model)
     return FitOutcome(*results, masks, warnings, tuple(missing.items()), memories)
@@ -125,7 +124,9 @@ class _LabelledFitter:
         hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
         model = model_of(self.rate, self.scaling, hysteresis, G, delay)
         if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
-            motion = [Means(run.u, run.x, run.known & ~run.held_out(), run.memory) for run in runs]
+            sure = [run.known & run.mask(*FITTED) & ~run.held_out() for run in runs]
+            both = zip(runs, sure, strict=True)
+            motion = [Means(x.u, x.x, k, x.memory) for x, k in both if k.any()]
             other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
             left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
             if other.law != 'plays' and left < (1.0 - LAW_GAIN) ** 2 * squares_left(model, runs):

@@ -178,7 +178,9 @@ class Guard:
 
     Examples
     --------
-    >>> guard = Guard(GuardSettings(0, 10, slew=1000, ramp_slew=20, rest=0, sample_rate=1000))
+    >>> import piezo_ident as pi
+    >>> settings = pi.GuardSettings(0, 10, slew=1000, ramp_slew=20, rest=0, sample_rate=1000)
+    >>> guard = pi.Guard(settings)
     >>> guard.process([0.0, 0.5, 5.0, float('nan'), 1.5]).voltage.tolist()
     [0.0, 0.5, 1.5, 2.5, 1.5]
     >>> float(guard.idle(1000)[-1])

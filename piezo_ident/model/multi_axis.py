@@ -53,7 +53,8 @@ class EachAxis(Mapping[str, T], Generic[T]):
 
     Examples
     --------
-    >>> errors = EachAxis({'y': 0.2, 'y_b': 0.3})
+    >>> import piezo_ident as pi
+    >>> errors = pi.EachAxis({'y': 0.2, 'y_b': 0.3})
     >>> errors['y_b'], list(errors)
     (0.3, ['y', 'y_b'])
     """

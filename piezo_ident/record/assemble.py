@@ -224,10 +224,12 @@ def _check_ranges(table: OrderedRows, options: ReadOptions, name: str) -> None:
                     'from all others; if it stands for no reading, leave these cells empty'
                 )
         others = {u: stroke * read / factor for u, factor in UNITS['y'].items()}
-        fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]] or [*others]
+        fitting = [u for u, s in others.items() if STROKE[0] <= s <= STROKE[1]]
         fitting = [f'1{u}' if options.displacement_unit else u for u in fitting]
-        way = f'--displacement-unit {next((u for u in fitting if u.endswith("um")), fitting[0])}'
+        best = next((u for u in fitting if u.endswith('um')), ''.join(fitting[:1]))
+        way = f'--displacement-unit {best}' if best else ''
         cure = f'name the unit of y with --displacement-unit {" or ".join(fitting)}'
+        cure = cure if fitting else 'no unit of y makes it one: is it the column of y?'
         if split_unit(unit)[0]:
             way, cure = '', 'is the number before the unit right?'
         elif STROKE[0] <= span <= STROKE[1] < stroke:

@@ -11,6 +11,7 @@ displacement alone is unusable, the new piece keeps the voltage of that time.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import itertools
@@ -367,6 +368,18 @@ class Record(Showable):
     def renamed(self, name: str) -> Record:
         """Return the same record under another name."""
         return replace(self, name=name)
+
+
+def named_apart(*groups: Iterable[Record]) -> Iterator[list[Record]]:
+    """Yield the groups with a number in equal names, as strokes and zeros go by the name."""
+    seen = Counter[str]()
+    for group in groups:
+        named = []
+        for record in group:
+            seen[record.name] += 1
+            n = seen[record.name]
+            named.append(record if n == 1 else replace(record, name=f'{record.name} ({n})'))
+        yield named
 
 
 def records_of(records: Record | Iterable[Record], where: str) -> list[Record]:

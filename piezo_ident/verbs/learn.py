@@ -117,6 +117,7 @@ def identify(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import piezo_ident as pi
     >>> v = 5.0 - 5.0 * np.cos(2.0 * np.pi * np.arange(4000) / 1000.0)
     >>> record = pi.Record.from_arrays(v, 1e-6 * v, sample_rate=1000.0)

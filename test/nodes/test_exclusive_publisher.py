@@ -82,14 +82,14 @@ def gives_way(output):
 @pytest.mark.parametrize(
     ('names', 'stays'), [(('one', 'one'), True), (('one', 'one'), False), (('one', 'two'), False)]
 )
-def test_two_that_start_at_the_same_moment_hear_each_other(made, names, stays):
+def test_two_that_start_at_the_same_moment_hear_each_other(made, monkeypatch, names, stays):
     outputs = made(*names, stays=stays)
     for output in outputs:
         output.open()
     until(lambda: all({output: output.poll(0, 10.0) for output in outputs}.values()))
-    if not stays:
-        # a reference may come long after the right to drive
-        time.sleep(exclusive_publisher.TOGETHER + 0.1)
+    # a reference may come long after the right to drive
+    with monkeypatch.context() as patch:
+        patch.setattr(exclusive_publisher, 'TOGETHER', 0.0)
         for output in outputs:
             output.refuse_foreign_blocks()
     # the same blocks, as of one program that is played twice

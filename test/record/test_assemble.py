@@ -274,7 +274,9 @@ def scaled(*by: float) -> list[np.ndarray]:
             changed(np.arange(500) % 10 > 0, 2, np.nan, columns(500)),
             '450 of 500 displacements .* in 50 places; .* all rows without a displacement',
         ),
-        *((scaled(1, 1, f), '--displacement-unit') for f in (1e6, 1e-6)),
+        (scaled(1, 1, 1e6), '--displacement-unit'),
+        # no unit makes it a stroke
+        (scaled(1, 1, 1e-6), 'is it the column of y'),
         (
             [columns()[k] for k in (0, 2, 1)],
             'v spans .* V; if v and y are swapped, .* --columns v=y,y=v, else name the unit',
