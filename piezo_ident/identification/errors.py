@@ -218,7 +218,7 @@ def squares_left(model: StageModel, runs: Sequence[Run]) -> float:
     """Sum the squared residuals over the held-out samples, around the mean of each run [m^2]."""
     left = 0.0
     for run in runs:
-        kept = run.held_out() & run.known
+        kept = run.held_out() & run.use
         if kept.any():
             e = _residual(model, run)[kept]
             left += float(np.sum((e - e.mean()) ** 2))

@@ -28,8 +28,6 @@ from piezo_ident.operators.hysteresis_law import HysteresisLaw
 
 Rule = Callable[[Array], Array]
 
-#: kinds of segments that the three steps fit; all others are only judged
-FITTED = ('triangle', 'noise', 'settle', 'step')
 #: number of blocks into which a run is thinned: to choose a guess, and to fit the memory
 ROUGH, BLOCKS = 500, 2000
 #: number of plays of the temporary H, and of the blocks of a run in the fit (both taste)
@@ -130,17 +128,16 @@ def lag_of(G: Dynamics, delay: Delay) -> float:
 
 def with_starts(runs: Sequence[Run], lag: float = 0.0) -> list[Run]:
     """
-    Fit the memory at the start of runs to their fitted samples.
+    Fit the memory at the start of runs to the fitted samples of their triangles.
 
     All samples of a run count as known once its memory is fitted.  `lag` is as in `fit_starts`.
     """
-    # triangles may not depend on what came before steps and noise
-    excerpts = [run.excerpt(run.mask(*FITTED) & run.use & ~run.held_out()) for run in runs]
+    excerpts = [run.excerpt(run.mask('triangle') & run.use & ~run.held_out()) for run in runs]
     driven = [i for i, e in enumerate(excerpts) if e.use.any()]
-    unknown = [bool((excerpts[i].use & ~runs[i].known).any()) for i in driven]
+    unknown = [not bool(np.array_equal(runs[i].known, runs[i].use)) for i in driven]
     fitted_runs = list(runs)
     rules = fit_starts([excerpts[i] for i in driven], unknown, lag)
-    for i, rule, is_sought in zip(driven, rules, unknown, strict=True):
-        if rule is not None and is_sought:
+    for i, rule in zip(driven, rules, strict=True):
+        if rule is not None:
             fitted_runs[i] = replace(runs[i], memory=rule, known=runs[i].use)
     return fitted_runs

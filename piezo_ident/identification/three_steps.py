@@ -25,7 +25,7 @@ from piezo_ident.identification.errors import (
 from piezo_ident.identification.prepare import Excerpt, excerpts_of, Run
 from piezo_ident.identification.results import FitOutcome, Steps
 from piezo_ident.identification.settings import Progress, Settings
-from piezo_ident.identification.starts import FITTED, lag_of, with_starts
+from piezo_ident.identification.starts import lag_of, with_starts
 from piezo_ident.identification.step1_delay import DelayResult, first_step
 from piezo_ident.identification.step2_dynamics import (
     beside_law,
@@ -40,6 +40,8 @@ from piezo_ident.model.scaling import Scaling
 from piezo_ident.model.stage_model import StageModel
 from piezo_ident.operators.dynamics import Delay, Dynamics
 
+#: kinds of segments that are fitted; all others are only judged
+FITTED = ('triangle', 'noise', 'settle', 'step')
 #: a model without a pair of poles and zeros that H may replace may err more by this share
 AS_WELL = 0.01
 #: largest orders that are tried besides `Settings.max_order` if G has such a pair

@@ -20,6 +20,7 @@ from piezo_ident.identification.refusals import refuse_undriven
 from piezo_ident.identification.results import Steps
 from piezo_ident.identification.settings import Settings
 from piezo_ident.identification.step1_delay import delay_from_steps
+from piezo_ident.identification.three_steps import FITTED
 from piezo_ident.identification.warnings import warnings_of
 from piezo_ident.model.files import load, model_from_dict, model_to_dict
 from piezo_ident.model.free_run import free_run
@@ -252,6 +253,45 @@ def test_a_level_that_drifts_under_small_motion_shows_the_law():
     assert error < 0.2
     plays = identify(record, QUICK)
     assert free_run(plays.model, record).errors.percent > 1.0
+    # what is only judged, as rests and ramps, has no say in it
+    kinds = [s for s in program.segments if s.kind in FITTED]
+    assert found.hysteresis.n < sum(s.n for s in kinds)
+
+
+def test_records_of_one_name_have_a_zero_and_a_stroke_each():
+    t = np.arange(6000) / 1000.0
+    v = 5.0 - 5.0 * np.cos(2.0 * np.pi * t) * np.exp(-t / 6.0)
+    y = replace(PAPER.model, sample_rate=1000.0, dynamics=Dynamics.unit()).simulate(v)
+    y = y + 2e-9 * np.random.default_rng(1).standard_normal(y.size)
+    one, two = (Record.from_arrays(v, x, sample_rate=1000.0) for x in (y, y + 300e-6))
+    result = identify([one, two], Settings(thresholds=8), validation=two)
+    assert {row.record for row in result.errors} == {'record', 'record (2)', 'record (3)'}
+    # a zero that has moved is no motion, and no error of what is judged
+    assert abs(result.stroke / np.ptp(y) - 1.0) < 0.01
+    assert all(row.percent < 0.5 for row in result.errors if row.data == 'held out')
+
+
+def test_unlabelled_parts_of_a_labelled_record_are_judged_and_a_wider_validation_is_told():
+    (piece,) = short().pieces
+    kept = tuple(s for s in piece.segments if s.kind in ('step', 'noise', 'triangle'))
+    half = Record((replace(piece, segments=kept),), 'in part')
+    model = quick().model
+    wide = replace(model, scaling=replace(model.scaling, V=2.0 * model.scaling.V))
+    t = np.arange(20_000) / 20_000.0
+    v = 9.0 - 9.0 * np.cos(4.0 * np.pi * t)
+    beyond = Record.from_arrays(v, wide.simulate(v), sample_rate=20_000.0, name='wide')
+    result = identify(half, QUICK, validation=beyond)
+    rows = [row for row in result.errors if row.record == 'in part']
+    assert sum(row.n for row in rows) == piece.n
+    assert [row.data for row in rows if not row.segment] == ['held out']
+    assert any('wide' in w and 'extrapolation' in w for w in result.warnings)
+
+
+def test_a_start_in_mid_range_is_told_by_what_comes_before_the_triangle():
+    (piece,) = short().pieces
+    first = next(s for s in piece.segments if s.kind == 'step').start
+    cut = identify(Record((piece.cut(first, piece.n),), 'from the steps on'), QUICK)
+    assert max(row.percent for row in cut.errors) < 0.05
 
 
 def test_delay_and_orders_may_be_given():

@@ -6,16 +6,20 @@
 import numpy as np
 from numpy.testing import assert_array_equal
 from paper_stage import A, B
+from piezo_ident.identification.prepare import prepare
+from piezo_ident.identification.settings import Settings, silent
 from piezo_ident.identification.step1_delay import (
     checked_delay,
     delay_from_loss,
     delay_from_steps,
     DelayResult,
     find_jumps,
+    first_step,
     step_responses,
 )
 from piezo_ident.operators.dynamics import Delay, Dynamics, filter_arx
-from piezo_ident.record.record import Piece
+from piezo_ident.operators.hysteresis import Hysteresis
+from piezo_ident.record.record import Piece, Record
 import pytest
 from scipy import signal
 
@@ -176,3 +180,17 @@ def test_a_delay_that_makes_no_difference_does_not_end_the_identification():
     y += 5.0 * y.std() * some.standard_normal(u.size)
     found = checked_delay(nothing, *split(u, y))
     assert found.source == 'none'
+
+
+@pytest.mark.parametrize('hold', [20, 25])
+def test_a_delay_from_periodic_steps_is_not_longer_by_the_time_between_them(hold):
+    rng = np.random.default_rng(1)
+    sos = signal.butter(4, 0.6, output='sos')
+    drive = 5.0 + 0.15 * signal.sosfilt(sos, rng.standard_normal(2500))
+    v = np.concatenate([np.repeat([5.0, 6.0] * 6, hold), drive])
+    w = Hysteresis(np.arange(1, 10) / 10, np.full(9, 0.04), 0.0, 0.64)(v / 10.0)
+    y = 80e-6 * Delay(2).apply(filter_arx(np.array([-0.6]), np.array([0.4]), w))
+    y += 5e-9 * rng.standard_normal(v.size)
+    labels = ['step', 'noise'], [0, 12 * hold]
+    record = Record.from_arrays(v, y, sample_rate=100.0, segments=labels)
+    assert first_step(prepare([record]).runs, Settings(), silent).samples <= 2

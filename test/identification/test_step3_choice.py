@@ -182,6 +182,12 @@ def test_several_excerpts_have_offsets_of_their_own():
     assert choice.errors['preisach'] < 0.5 * choice.errors['plays']
 
 
+@pytest.mark.parametrize('count', [6, 7])
+def test_any_number_of_excerpts_chooses(count):
+    one = excerpt('leaning relays', TRIANGLE)
+    assert choose_law([one] * count, G, D).law is not None
+
+
 def test_noise_chooses_nothing():
     given = excerpt('plays', TRIANGLE, noise=0.01)
     assert choose_law([given], G, D).law is None
