@@ -225,7 +225,7 @@ def no_step(step: StepDelay | None) -> str:
     """Say why the steps do not tell the delay: they are absent, or stay within the noise."""
     if step is None or not step.repeats:
         return 'there are no steps out of a rest'
-    return 'no step rises above the sensor noise'
+    return f'no step rises above the sensor noise within {step.lag[-1] + 1} samples'
 
 
 def delay_from_loss(loss: Array) -> int | None:
