@@ -35,8 +35,8 @@ NURSERY = Nursery()
 
 def set_middleware() -> None:
     """Keep all nodes to this machine, and have them meet and part quickly."""
-    # any other range would add transports to those of the profile, such as shared memory
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+    # this range adds shared memory, and FASTDDS_BUILTIN_TRANSPORTS has no say in it
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     profile = Path(__file__).with_name('prompt_discovery.xml')
     os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(profile))
 
@@ -114,8 +114,26 @@ def take_domain() -> tuple[int, IO[str]]:
         except OSError:
             lock.close()
             continue
+        _clear_ports(domain)
         return domain, lock
     raise RuntimeError('all ROS domains are in use')
+
+
+def _clear_ports(domain: int) -> None:
+    """Remove what a node that was killed left locked: the next one on its port would hang."""
+    first = 7400 + 250 * domain
+    for path in Path('/dev/shm').glob('*fastrtps_port*'):
+        if int(re.sub(r'\D', '', path.name)) in range(first, first + 250):
+            path.unlink(missing_ok=True)
+
+
+def _shared_memory(pid: int) -> list[Path]:
+    """Return the shared memory of the middleware that a process owns, and would leave behind."""
+    held = []
+    with contextlib.suppress(OSError):
+        held = [os.readlink(fd) for fd in Path(f'/proc/{pid}/fd').iterdir()]
+    locks = [h for h in held if re.fullmatch(r'/dev/shm/fastrtps_[0-9a-f]{16}_el', h)]
+    return [Path(name) for lock in locks for name in (lock, lock.removesuffix('_el'))]
 
 
 class Handle:
@@ -196,12 +214,18 @@ class Handle:
     def die(self) -> None:
         """End it outright, and nothing but it."""
         self.is_ended = True
+        left = _shared_memory(self.process.pid)
         self.process.send_signal(signal.SIGKILL)
         self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
 
     def kill(self) -> None:
         """End it outright, with all that it started."""
         self.is_ended = True
+        left = _shared_memory(self.process.pid)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(LIMIT)
+        for path in left:
+            path.unlink(missing_ok=True)
