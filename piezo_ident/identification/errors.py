@@ -209,7 +209,8 @@ def moves_on(model: StageModel, runs: Sequence[Run]) -> bool:
             for kinds in (('triangle',), ('step', 'settle', 'noise'))
         )
         if sweeps.size and small.size:
-            if abs(float(small.mean() - sweeps.mean())) > ELSEWHERE * float(sweeps.std()):
+            shift = float(small.mean() - sweeps.mean())
+            if abs(shift) > ELSEWHERE * float(sweeps.std()):
                 return True
     return False
 

@@ -107,7 +107,8 @@ def fit_starts(
 
     def full_fit(one: Fit) -> Fit:
         starts, guesses = (np.repeat(x, FINER, 1) for x in (one.stage.starts, one.stage.guesses))
-        return fit(replace(one.stage, starts=starts, guesses=guesses), stretches, iterations=MANY)
+        finer = replace(one.stage, starts=starts, guesses=guesses)
+        return fit(finer, stretches, iterations=MANY)
 
     plain, *others = map(rough_fit, _guesses())
     plain, *others = map(full_fit, [plain, *sorted(others, key=lambda one: one.loss)[:BEST]])

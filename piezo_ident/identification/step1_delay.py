@@ -139,7 +139,8 @@ def find_jumps(v: Array, before: int, after: int) -> Integers:
         return np.asarray(large, dtype=np.int64)
     # ahead[k - before] is the largest difference between the samples k - before .. k - 1
     ahead = np.lib.stride_tricks.sliding_window_view(dv, before - 1).max(axis=1)
-    return np.asarray(large[ahead[large - before] < 0.05 * dv[large - 1]], dtype=np.int64)
+    quiet = ahead[large - before] < 0.05 * dv[large - 1]
+    return np.asarray(large[quiet], dtype=np.int64)
 
 
 def step_responses(
@@ -217,7 +218,8 @@ def delay_from_steps(pieces: Sequence[Piece], before: int = 100, after: int = 60
         rest = (_mean(np.delete(responses, i, 0), np.delete(weight, i)) for i in range(n))
         left_out = [_first_rise(mean_of_rest, before, rounding)[0] for mean_of_rest in rest]
         delays = np.array([after if s is None else s for s in left_out], dtype=float)
-        std = max(std, float(np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))))
+        jackknife = np.sqrt((n - 1) / n * np.sum((delays - delays.mean()) ** 2))
+        std = max(std, float(jackknife))
     return StepDelay(samples, std, n, noise, threshold, lag, mean)
 
 

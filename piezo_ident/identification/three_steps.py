@@ -126,9 +126,7 @@ class _LabelledFitter:
         hysteresis = third_step(fit, held, G, delay, settings, progress, others=small)
         model = model_of(self.rate, self.scaling, hysteresis, G, delay)
         if hysteresis.law == 'plays' and settings.thresholds is None and moves_on(model, runs):
-            sure = [run.known & run.mask(*FITTED) & ~run.held_out() for run in runs]
-            both = zip(runs, sure, strict=True)
-            motion = [Means(x.u, x.x, k, x.memory) for x, k in both if k.any()]
+            motion = [Means(e.u, e.x, e.use, e.memory) for e in excerpts_of(runs, *FITTED)]
             other = third_step(fit, held, G, delay, settings, progress, motion, others=small)
             left = squares_left(model_of(self.rate, self.scaling, other, G, delay), runs)
             if other.law != 'plays' and left < (1.0 - LAW_GAIN) ** 2 * squares_left(model, runs):

@@ -249,7 +249,8 @@ class ExcitationNode(LabNode):
         sequence = playing.sequence
         speed = playing.factor * sequence.sample_rate
         # blocks that are sent late all at once must fit into the queues of the readers
-        clock = Schedule(speed, time.monotonic(), min(SLIP, CATCH_UP * playing.block_size / speed))
+        slip = min(SLIP, CATCH_UP * playing.block_size / speed)
+        clock = Schedule(speed, time.monotonic(), slip)
         playing.clock = clock
         for start, stop, label in cut_blocks(sequence.n, sequence.segments, playing.block_size):
             self._sleep(playing, clock.due(start))

@@ -228,8 +228,9 @@ def _check_ranges(table: OrderedRows, options: ReadOptions, name: str) -> None:
         fitting = [f'1{u}' if options.displacement_unit else u for u in fitting]
         best = next((u for u in fitting if u.endswith('um')), ''.join(fitting[:1]))
         way = f'--displacement-unit {best}' if best else ''
-        cure = f'name the unit of y with --displacement-unit {" or ".join(fitting)}'
-        cure = cure if fitting else 'no unit of y makes it one: is it the column of y?'
+        cure = 'no unit of y makes it one: is it the column of y?'
+        if fitting:
+            cure = f'name the unit of y with --displacement-unit {" or ".join(fitting)}'
         if split_unit(unit)[0]:
             way, cure = '', 'is the number before the unit right?'
         elif STROKE[0] <= span <= STROKE[1] < stroke:

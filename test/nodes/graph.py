@@ -48,7 +48,6 @@ from processes import (
     in_time,
     LIMIT,
     listens,
-    PULSE,
     set_middleware,
     take_domain,
 )
@@ -75,7 +74,6 @@ class Graph(Observer):
 
     def __enter__(self) -> Graph:
         self.domain, self._lock = take_domain()
-        PULSE.still = 0.0
         self.folder = Path(tempfile.mkdtemp(prefix='piezo_ident_graph_'))
         set_middleware()
         self.environment = {
