@@ -89,6 +89,14 @@ def test_what_is_out_of_reach_is_refused_or_clipped_and_told():
         pi.invert(PAPER, np.full(10, 100e-6))
 
 
+@pytest.mark.parametrize('start', [0.0, -5e-6])
+def test_a_motion_wider_than_the_reach_is_told_to_be_narrower(start):
+    # no shift brings 60 um within the 36.3 um of 0 .. 5 V
+    wanted = start + 30e-6 * (1.0 - np.cos(np.arange(4000) / 4000 * 2 * np.pi))
+    with pytest.raises(DataError, match='narrower than the 36'):
+        pi.invert(PAPER, wanted, limits=(0.0, 5.0))
+
+
 def test_a_motion_that_begins_at_once_needs_a_lead():
     wanted = np.concatenate([np.linspace(10e-6, 40e-6, 400), np.full(400, 40e-6)])
     drive = pi.invert(PAPER, wanted)

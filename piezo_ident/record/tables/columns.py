@@ -361,8 +361,8 @@ def _missing(
     likely = ('', *UNITS['v'], *UNITS['y'])
     fit = [i for i in free if 't' in missing or name_and_unit(names[i])[1] in likely] or free
     # of several runs in a file, the columns of the run that was named
-    groups = {name.rpartition('.')[0] for i, name in enumerate(names) if i not in free}
-    fit = [i for i in fit if names[i].rpartition('.')[0] in groups] or fit
+    groups = {_group(name) for i, name in enumerate(names) if i not in free}
+    fit = [i for i in fit if _group(names[i]) in groups] or fit
     ways = [names[i] or str(i + 1) for i in fit]
     fault = f'{path}: {", ".join(missing)} missing (found: {listed(names) or "nothing"})'
     further = ''

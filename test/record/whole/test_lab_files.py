@@ -686,3 +686,14 @@ def test_a_rate_that_is_suggested_is_the_one_in_the_file(tmp_path, capsys, head)
     shown = capsys.readouterr().err.partition('for example: piezo_ident ')[2]
     assert main([*shlex.split(shown), '--displacement-unit', 'um']) == 0
     assert pi.read(out).pieces[0].sample_rate == RATE
+
+
+def test_the_columns_of_the_run_that_was_named_are_suggested(tmp_path):
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(tmp_path / 'r.h5', 'w') as file:
+        for run in ('run1', 'run2'):
+            for name, column in (('time', np.arange(V.size) / RATE), ('ao0', V), ('pos', UM)):
+                file[f'{run}/{name}'] = column
+    with pytest.raises(DataError, match=r'v=run2\.\w+') as refusal:
+        pi.read(tmp_path / 'r.h5', columns={'t': 'run2.time'})
+    assert 'run1' not in refusal.value.options
